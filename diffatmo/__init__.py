@@ -1,0 +1,104 @@
+"""Which atmosphere made this sky? A differentiable sky model in JAX.
+
+The names below are the public interface. They are imported when first used, so that ``import diffatmo`` costs nothing and
+``diffatmo --help`` answers at once.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from diffatmo import atmosphere, camera, color, constants, geometry, imageio, models, numerics, phase
+    from diffatmo import render, spectrum, sun, transmittance
+    from diffatmo.atmosphere import Atmosphere, AtmosphereError, earth, load, mars, save
+    from diffatmo.camera import Camera, Equirectangular, Fisheye, Pinhole
+    from diffatmo.imageio import ImageError
+    from diffatmo.models import Model, Moments, PathTrace, RayMarch, Sky, View
+    from diffatmo.render import Scene
+
+__version__ = "0.1.0"
+
+_HOME = {
+    "Atmosphere": "atmosphere",
+    "AtmosphereError": "atmosphere",
+    "Camera": "camera",
+    "Equirectangular": "camera",
+    "Fisheye": "camera",
+    "ImageError": "imageio",
+    "Model": "models",
+    "Moments": "models",
+    "PathTrace": "models",
+    "Pinhole": "camera",
+    "RayMarch": "models",
+    "Scene": "render",
+    "Sky": "models",
+    "View": "models",
+    "earth": "atmosphere",
+    "load": "atmosphere",
+    "mars": "atmosphere",
+    "save": "atmosphere",
+}
+"""Public name -> the module it lives in."""
+
+_MODULES = (
+    "atmosphere",
+    "camera",
+    "color",
+    "constants",
+    "geometry",
+    "imageio",
+    "models",
+    "numerics",
+    "phase",
+    "render",
+    "spectrum",
+    "sun",
+    "transmittance",
+)
+
+__all__ = [
+    "Atmosphere",
+    "AtmosphereError",
+    "Camera",
+    "Equirectangular",
+    "Fisheye",
+    "ImageError",
+    "Model",
+    "Moments",
+    "PathTrace",
+    "Pinhole",
+    "RayMarch",
+    "Scene",
+    "Sky",
+    "View",
+    "__version__",
+    "atmosphere",
+    "camera",
+    "color",
+    "constants",
+    "earth",
+    "geometry",
+    "imageio",
+    "load",
+    "mars",
+    "models",
+    "numerics",
+    "phase",
+    "render",
+    "save",
+    "spectrum",
+    "sun",
+    "transmittance",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _MODULES:
+        return import_module(f"diffatmo.{name}")
+    if name in _HOME:
+        return getattr(import_module(f"diffatmo.{_HOME[name]}"), name)
+    raise AttributeError(f"module 'diffatmo' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return __all__

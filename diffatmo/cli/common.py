@@ -1,0 +1,66 @@
+"""What the subcommands share: their error, the choice of a model, and the checks of what they read and write."""
+
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+if TYPE_CHECKING:
+    from diffatmo.atmosphere import Atmosphere
+    from diffatmo.models import Model
+
+MODELS = ("moments", "raymarch", "pathtrace")
+"""Names of ``diffatmo.models.MODELS``, repeated here because importing that takes seconds; a test compares the two."""
+
+
+class InputError(ValueError):
+    """Something the user gave is wrong; the message says what, and what would be right."""
+
+
+model_option = click.option(
+    "--model",
+    type=click.Choice(MODELS),
+    default=MODELS[0],
+    show_default=True,
+    help="moments: all orders of scattering; raymarch: single scattering; pathtrace: Monte Carlo.",
+)
+overwrite_option = click.option("--overwrite", is_flag=True, help="Replace files that exist.")
+
+
+def read_atmosphere(name: str) -> "Atmosphere":
+    """The atmosphere in the file ``name``, or the preset of that name."""
+    from diffatmo import atmosphere
+
+    if Path(name).exists():
+        return atmosphere.load(name)
+    if name in atmosphere.PRESETS:
+        return atmosphere.PRESETS[name]()
+    raise InputError(f"{name}: no such file, and no preset of that name (presets: {', '.join(atmosphere.PRESETS)})")
+
+
+def check_output(path: Path, *, overwrite: bool) -> None:
+    """Refuse an output file that cannot be written or would replace another, before any work is done for it."""
+    if path.is_dir():
+        raise InputError(f"{path}: is a directory, expected the name of a file to write")
+    if not overwrite and path.exists() and path.stat().st_size:
+        raise InputError(f"{path}: exists; give --overwrite to replace it")
+    check_writable(path.parent)
+
+
+def check_writable(directory: Path) -> None:
+    """Refuse a directory that does not exist or that no file can be created in."""
+    if not directory.is_dir():
+        raise InputError(f"{directory}: no such directory")
+    try:
+        with tempfile.TemporaryFile(dir=directory):
+            pass
+    except OSError as error:
+        raise InputError(f"{directory}: cannot be written to: {error.strerror}") from error
+
+
+def make_model(name: str) -> "Model":
+    """The model called ``name``, at its default resolution."""
+    from diffatmo import models
+
+    return models.MODELS[name]()

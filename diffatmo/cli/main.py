@@ -1,0 +1,74 @@
+"""The ``diffatmo`` command: its subcommands, and how it ends.
+
+Exit status: 0 for success, 1 for a fit that did not converge (its best point is written all the same), 2 for bad input,
+reported in one line on the standard error.
+"""
+
+import sys
+from collections.abc import Sequence
+
+import click
+
+from diffatmo import __version__
+from diffatmo.cli.common import InputError
+from diffatmo.cli.fit import fit
+from diffatmo.cli.radiance import radiance
+from diffatmo.cli.render import render
+
+BAD_INPUT = 2
+INTERRUPTED = 130
+
+
+@click.group(invoke_without_command=True, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__, message="%(prog)s %(version)s")
+@click.pass_context
+def diffatmo(context: click.Context) -> None:
+    """Which atmosphere made this sky?
+
+    A differentiable sky model, and a fit that recovers an atmosphere's parameters from images, with error bars.
+    """
+    if context.invoked_subcommand is None:
+        click.echo(context.get_help())
+
+
+diffatmo.add_command(radiance)
+diffatmo.add_command(render)
+diffatmo.add_command(fit)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line ``arguments`` (those of the process by default) and return its exit status."""
+    try:
+        status = diffatmo.main(args=arguments, prog_name="diffatmo", standalone_mode=False)
+    except click.Abort:
+        return INTERRUPTED
+    except (click.ClickException, InputError, OSError) as error:
+        return _refuse(error)
+    except ValueError as error:
+        if not _is_bad_input(error):
+            raise
+        return _refuse(error)
+    return status or 0
+
+
+def _is_bad_input(error: ValueError) -> bool:
+    """Whether the library refused a value it was given; any other ValueError is a fault of ours and keeps its traceback."""
+    from diffatmo.atmosphere import AtmosphereError
+    from diffatmo.imageio import ImageError
+
+    return isinstance(error, AtmosphereError | ImageError)
+
+
+def _refuse(error: Exception) -> int:
+    if isinstance(error, click.ClickException):
+        message = error.format_message()
+    elif isinstance(error, OSError) and error.filename is not None:
+        message = f"{error.filename}: {error.strerror}"
+    else:
+        message = str(error)
+    print("diffatmo: error:", " ".join(message.split()), file=sys.stderr)
+    return BAD_INPUT
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,162 @@
+"""``diffatmo radiance``: radiance and transmittance of an atmosphere along a table of directions."""
+
+import csv
+import math
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from diffatmo.cli.common import InputError, check_output, make_model, model_option, overwrite_option, read_atmosphere
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from diffatmo.atmosphere import Atmosphere
+    from diffatmo.models import Model
+
+COLUMNS = {
+    "altitude_km": (0.0, math.inf),
+    "sun_zenith_deg": (0.0, 180.0),
+    "view_zenith_deg": (0.0, 180.0),
+    "view_azimuth_deg": (-math.inf, math.inf),
+}
+"""The columns that are read, with the range of each."""
+
+CHUNK = 4096
+"""Rows computed at a time: bounds the memory, whatever the length of the table."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of directions: its rows as they were written, and the numbers of ``COLUMNS`` in that order."""
+
+    header: list[str]
+    rows: list[list[str]]
+    numbers: list[list[float]]
+
+
+@click.command()
+@click.argument("atmosphere", metavar="ATM.toml")
+@click.argument("directions", metavar="DIRECTIONS.csv", type=click.Path(path_type=Path))
+@click.option("-o", "--output", metavar="OUT.csv", type=click.Path(path_type=Path), required=True, help="File to write.")
+@model_option
+@click.option("--x64", is_flag=True, help="Compute in double precision.")
+@overwrite_option
+def radiance(atmosphere: str, directions: Path, output: Path, model: str, x64: bool, overwrite: bool) -> None:
+    """Radiance along a table of directions.
+
+    ATM.toml is an atmosphere file or the name of a preset. DIRECTIONS.csv has the columns altitude_km, sun_zenith_deg,
+    view_zenith_deg and view_azimuth_deg, the azimuth relative to the sun's. OUT.csv repeats its rows in the same order,
+    followed by radiance_<nm> and transmittance_<nm> for every wavelength, and stderr_<nm> for the path tracer. Sunlit and
+    skylit ground is included where the ray meets it, the sun's disc is not.
+    """
+    check_output(output, overwrite=overwrite)
+    table = read_table(directions)
+    import jax
+
+    with ExitStack() as stack:
+        if x64:
+            stack.enter_context(jax.enable_x64(True))
+        air = read_atmosphere(atmosphere)
+        taken = sorted(set(table.header) & set(new_columns(air)))
+        if taken:
+            raise InputError(f"{directions}: has a column {taken[0]} already")
+        columns = compute(air, table, make_model(model))
+    write_table(output, table, columns)
+
+
+def read_table(path: Path) -> Table:
+    """Read a table of directions; every number in it is checked."""
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            lines = [(number, row) for number, row in enumerate(csv.reader(file), start=1) if any(map(str.strip, row))]
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path}: not a CSV file: {error}") from error
+    if not lines:
+        raise InputError(f"{path}: empty, expected a header with {', '.join(COLUMNS)}")
+    header = [name.strip() for name in lines[0][1]]
+    for name in COLUMNS:
+        if header.count(name) != 1:
+            problem = "missing" if name not in header else "given more than once"
+            raise InputError(f"{path}: column {name} {problem}; columns needed: {', '.join(COLUMNS)}")
+    if len(lines) == 1:
+        raise InputError(f"{path}: no rows below the header")
+    rows = [row for _, row in lines[1:]]
+    numbers = [_numbers(f"{path}: line {number}", header, row) for number, row in lines[1:]]
+    return Table(header, rows, numbers)
+
+
+def _numbers(where: str, header: list[str], row: list[str]) -> list[float]:
+    if len(row) != len(header):
+        raise InputError(f"{where}: {len(row)} values, expected {len(header)}")
+    numbers = []
+    for name, (lowest, highest) in COLUMNS.items():
+        text = row[header.index(name)].strip()
+        expected = "a number" if math.isinf(lowest) else f"a number from {lowest:g} to {highest:g}"
+        try:
+            number = float(text)
+        except ValueError as error:
+            raise InputError(f"{where}, {name}: got {text!r}, expected {expected}") from error
+        if not math.isfinite(number) or not lowest <= number <= highest:
+            raise InputError(f"{where}, {name}: got {text}, expected {expected}")
+        numbers.append(number)
+    return numbers
+
+
+def compute(atmosphere: "Atmosphere", table: Table, model: "Model") -> dict[str, list[str]]:
+    """The columns to add: name -> one text per row, with the digits that its precision has."""
+    import equinox as eqx
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+
+    from diffatmo.atmosphere import to_dict
+
+    altitude, sun_zenith, view_zenith, view_azimuth = np.asarray(table.numbers).T
+    degrees = np.radians(np.stack([sun_zenith, view_zenith, view_azimuth]))
+    sun = _direction(degrees[0], np.zeros_like(degrees[0]))
+    view = _direction(degrees[1], degrees[2])
+
+    # One shape, and so one compilation, serves every chunk; the last one repeats its last row.
+    size = min(CHUNK, 1 << (len(table.rows) - 1).bit_length())
+    sky = eqx.filter_jit(model.sky)(atmosphere)
+    answer = eqx.filter_jit(lambda sky, rays: sky.radiance(altitude=rays[0], view=rays[1], sun=rays[2]))
+    parts = []
+    for start in range(0, len(table.rows), size):
+        rows = np.minimum(np.arange(start, start + size), len(table.rows) - 1)
+        rays = [jnp.asarray(array[rows], jnp.result_type(float)) for array in (altitude, view, sun)]
+        parts.append(jax.device_get(answer(sky, rays)))
+    names = [label(wavelength) for wavelength in to_dict(atmosphere)["wavelengths_nm"]]
+    columns = {}
+    for quantity in ("radiance", "transmittance"):
+        values = np.concatenate([getattr(part, quantity) for part in parts])[: len(table.rows)]
+        columns |= {f"{quantity}_{name}": [str(x) for x in values[:, i]] for i, name in enumerate(names)}
+    return columns
+
+
+def label(wavelength: float) -> str:
+    """A wavelength in a column's name: as few digits as say it exactly, ``680`` for 680.0."""
+    return str(int(wavelength)) if wavelength == int(wavelength) else repr(wavelength)
+
+
+def _direction(zenith: "np.ndarray", azimuth: "np.ndarray") -> "np.ndarray":
+    """Unit vectors in the local frame: x east, y north (here towards the sun), z up."""
+    import numpy as np
+
+    return np.stack(
+        [np.sin(zenith) * np.sin(azimuth), np.sin(zenith) * np.cos(azimuth), np.cos(zenith)], axis=-1
+    )
+
+
+def write_table(path: Path, source: Path, table: Table, columns: dict[str, list[str]]) -> None:
+    """Write the table's own columns as they were, then the new ones."""
+    taken = sorted(set(columns) & set(table.header))
+    if taken:
+        raise InputError(f"{source}: has a column {taken[0]} already")
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow([*table.header, *columns])
+        writer.writerows([*row, *new] for row, new in zip(table.rows, zip(*columns.values(), strict=True), strict=True))

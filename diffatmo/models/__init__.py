@@ -1,0 +1,10 @@
+"""Models of the sky: one interface (:mod:`diffatmo.models.base`), several ways to the same radiance."""
+
+from diffatmo.models.base import Model, Path, Ray, Sky, View
+from diffatmo.models.moments import Moments
+from diffatmo.models.raymarch import RayMarch
+
+MODELS: dict[str, type[Model]] = {"moments": Moments, "raymarch": RayMarch}
+"""Models by the name the command line takes."""
+
+__all__ = ["MODELS", "Model", "Moments", "Path", "Ray", "RayMarch", "Sky", "View"]

@@ -1,0 +1,53 @@
+"""Numerical building blocks whose value *and* derivative are finite everywhere.
+
+The rule: guard the input of ``sqrt``, ``log``, ``arccos`` and ``/``, never their output. ``where(x > 0, sqrt(x), 0)``
+has a NaN derivative at ``x <= 0``, because the untaken branch is differentiated as well and 0 * inf is NaN.
+"""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+
+def tiny(dtype: jnp.dtype) -> float:
+    """The smallest number whose square root and reciprocal are still far from overflow in ``dtype``."""
+    return float(np.sqrt(np.finfo(dtype).tiny))
+
+
+def safe_sqrt(x: Float[Array, "..."]) -> Float[Array, "..."]:
+    """sqrt(x) for x > 0 and 0 otherwise; the derivative is 0 where x <= 0."""
+    positive = x > 0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1)), 0)
+
+
+def safe_divide(
+    numerator: Float[Array, "..."], denominator: Float[Array, "..."], otherwise: float = 0.0
+) -> Float[Array, "..."]:
+    """numerator / denominator, and ``otherwise`` (with derivative 0) where the denominator is 0."""
+    zero = denominator == 0
+    return jnp.where(zero, otherwise, numerator / jnp.where(zero, 1, denominator))
+
+
+def safe_log(x: Float[Array, "..."]) -> Float[Array, "..."]:
+    """log(x), held at the log of the smallest safe number (derivative 0) below it."""
+    floor = tiny(jnp.asarray(x).dtype)
+    above = x > floor
+    return jnp.where(above, jnp.log(jnp.where(above, x, 1)), np.log(floor))
+
+
+def safe_arccos(x: Float[Array, "..."]) -> Float[Array, "..."]:
+    """arccos(x) clamped to [-1, 1]; the derivative is 0 at and beyond the ends."""
+    inside = jnp.abs(x) < 1
+    return jnp.where(inside, jnp.arccos(jnp.where(inside, x, 0)), jnp.where(x > 0, 0, jnp.pi))
+
+
+def safe_norm(x: Float[Array, "... n"]) -> Float[Array, "..."]:
+    """Euclidean length over the last axis; the derivative is 0 at the origin."""
+    return safe_sqrt(jnp.sum(x * x, axis=-1))
+
+
+def gauss_legendre(count: int, lower: float = 0.0, upper: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes and weights of the ``count``-point Gauss-Legendre rule on [lower, upper], as float64 NumPy arrays."""
+    x, w = np.polynomial.legendre.leggauss(count)
+    half = 0.5 * (upper - lower)
+    return lower + half * (x + 1), half * w

@@ -1,0 +1,79 @@
+"""Single scattering along a ray, without phase functions: what every model of the sky starts from.
+
+Bruneton & Neyret 2008, eq. 7 without the phase function: ΔS_R = ∫ T(view) T(sun) β_R ds, and the same for the aerosol.
+They are smooth functions of (altitude, mu, mu_s, nu); multiplied by the exact phase functions they are exact.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from diffatmo import geometry, phase, rays, transmittance
+from diffatmo._types import Altitude, Cosine, Radiance, Transmittance
+from diffatmo.atmosphere import Atmosphere
+
+AUREOLE_ORDERS = 2
+"""Terms kept of repeated forward scattering (orders 2 and 3)."""
+
+
+class Single(NamedTuple):
+    """Phase-free single scattering along a ray that starts inside the atmosphere, per unit of phase function."""
+
+    rayleigh: Float[Array, "... w"]
+    mie: Float[Array, "... w"]
+    aureole: tuple[Float[Array, "... w"], ...]
+    """The aerosol integral weighted by τ^(n-1)/(n-1)!, τ the aerosol scattering optical depth towards the sun, n = 2, 3…"""
+    transmittance: Transmittance
+    """To the end of the ray."""
+
+
+def integrate(
+    atmosphere: Atmosphere,
+    columns: transmittance.Columns,
+    altitude: Altitude,
+    mu: Cosine,
+    mu_s: Cosine,
+    nu: Cosine,
+    ground: Float[Array, "..."],
+    *,
+    steps: int,
+    aureole: int = 0,
+    nodes: rays.Nodes | None = None,
+) -> Single:
+    """Integrate along each ray to its end, with four pieces of ``steps`` nodes cut where the planet's shadow begins.
+
+    ``aureole`` more integrals serve repeated forward scattering. ``nodes`` (one piece) replaces the default quadrature.
+    """
+    radius = atmosphere.bottom_radius
+    altitude, mu, mu_s, nu, ground = jnp.broadcast_arrays(altitude, mu, mu_s, nu, ground)
+    if nodes is None:
+        crossings = rays.shadow_crossings(altitude, mu, mu_s, nu, radius)
+        nodes = rays.trace(altitude, mu, ground, radius, atmosphere.top_altitude, steps, crossings)
+    along, end = transmittance.columns_along(atmosphere, altitude, mu, nodes, steps)
+    mu_s_here = geometry.mu_s_along(
+        altitude[..., None], mu[..., None], mu_s[..., None], nu[..., None], nodes.distance, radius
+    )
+    towards_sun, free = columns(nodes.altitude, mu_s_here)
+    depth = transmittance.optical_depth(atmosphere, jnp.where(free[..., None], along + towards_sun, 0))
+    light = atmosphere.solar_irradiance * jnp.where(free[..., None], jnp.exp(-depth), 0)
+    density = transmittance.densities(atmosphere, nodes.altitude) * nodes.weight[..., None]
+    aerosol = light * density[..., 1, None]
+    repeated = []
+    forward = jnp.where(free, towards_sun[..., 1], 0)[..., None] * atmosphere.mie_scattering
+    term = aerosol
+    for order in range(1, aureole + 1):
+        term = term * forward / order
+        repeated.append(atmosphere.mie_scattering * jnp.sum(term, axis=-2))
+    return Single(
+        rayleigh=atmosphere.rayleigh_scattering * jnp.sum(light * density[..., 0, None], axis=-2),
+        mie=atmosphere.mie_scattering * jnp.sum(aerosol, axis=-2),
+        aureole=tuple(repeated),
+        transmittance=jnp.exp(-transmittance.optical_depth(atmosphere, end)),
+    )
+
+
+def radiance(atmosphere: Atmosphere, single: Single, nu: Cosine) -> Radiance:
+    """Single scattering with its phase functions (Bruneton & Neyret 2008, eq. 7)."""
+    aerosol = phase.mie(nu, atmosphere.mie_g, atmosphere.mie_phase)
+    return phase.rayleigh(nu)[..., None] * single.rayleigh + aerosol[..., None] * single.mie

@@ -1,0 +1,340 @@
+"""One photographed sky: an image with its camera, place, sun, noise, mask and exposure, ready to be fitted.
+
+:func:`observe` checks and prepares a single image, :func:`stack` puts several into arrays of one shape.
+
+*Noise.* A pixel of signal S (in the image's own units) has the variance ``(noise S)² + shot S + floor²``. Where S comes
+from is the business of :mod:`fitting.solve`; taking the noisy pixel itself would weight low outliers more than high ones.
+
+*Large images* are averaged in square blocks until at most ``max_pixels`` remain; a block has the mean radiance and the mean
+direction of its unmasked pixels, and the noise of that mean. The radiance of the mean direction differs from the mean
+radiance by about (block width)² / 24 times the second derivative, which matters close to the sun and the horizon only.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any, NamedTuple, Protocol
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from fitting._errors import FitError
+
+FIXED = "fixed"
+FREE = "free"
+PER_CHANNEL = "-per-channel"
+
+NOISE = 0.01
+MAX_PIXELS = 20_000
+SUN_EXCLUSION = math.radians(2.0)
+
+
+class Camera(Protocol):
+    """What is needed of a camera: a direction for every pixel, and which pixels see anything."""
+
+    def directions(self) -> Float[Array, "height width 3"]:
+        """Unit vector of each pixel's centre; x east, y north, z up."""
+
+    def valid(self) -> Bool[Array, "height width"]:
+        """Whether the pixel is inside the picture (a fisheye's circle)."""
+
+
+class Observation(eqx.Module):
+    """An image to be fitted, on its (possibly coarser) pixel grid; made by :func:`observe`."""
+
+    name: str = eqx.field(static=True)
+    exposure: str = eqx.field(static=True)
+    exposure_value: float
+    altitude: float
+    sun: Float[np.ndarray, "3"]
+    image: Float[np.ndarray, "height width w"]
+    directions: Float[np.ndarray, "height width 3"]
+    shown: Bool[np.ndarray, "height width"]
+    used: Bool[np.ndarray, "height width"]
+    noise: Float[np.ndarray, "height width w"]
+    noise_shot: Float[np.ndarray, "height width w"]
+    noise_floor: Float[np.ndarray, "height width w"]
+    masked: dict[str, int] = eqx.field(static=True)
+    block: int = eqx.field(static=True)
+
+
+def observe(
+    pixels: Float[np.ndarray, "height width w"],
+    *,
+    camera: Camera,
+    altitude: float,
+    sun: Float[np.ndarray, "3"],
+    noise: float | np.ndarray = NOISE,
+    noise_shot: float | np.ndarray = 0.0,
+    noise_floor: float | np.ndarray | None = None,
+    mask: Bool[np.ndarray, "height width"] | None = None,
+    saturation: float | None = None,
+    sun_exclusion: float = SUN_EXCLUSION,
+    view_zenith_max: float = math.pi / 2,
+    horizon_exclusion: float = 0.0,
+    exposure: str = FIXED,
+    exposure_value: float = 1.0,
+    max_pixels: int = MAX_PIXELS,
+    name: str = "image",
+) -> Observation:
+    """Prepare one image for fitting; raises :class:`FitError` for anything that cannot be right.
+
+    Args:
+        pixels: Linear radiance times exposure.
+        camera: Where each pixel looks.
+        altitude: Of the camera above the ground, km.
+        sun: Unit vector towards the sun.
+        noise: Standard deviation relative to the signal; a number, or one per channel, pixel, or both.
+        noise_shot: Variance per unit of signal (photon noise), like ``noise``.
+        noise_floor: Standard deviation of a dark pixel, like ``noise``; default 1e-4 of the image's median.
+        mask: True where the pixel may be used.
+        saturation: Pixels with a channel at or above this value are not used.
+        sun_exclusion: Radius, in radians, of the disc around the sun that is not used.
+        view_zenith_max: Largest view zenith angle used, radians: π/2 for the sky alone, π for the ground too.
+        horizon_exclusion: Elevations closer to 0 than this, radians, are not used.
+        exposure: ``"fixed"``, ``"free"`` (a factor of this image's own) or the name of a group of images that share one;
+            with ``-per-channel`` appended (``"free-per-channel"``) there is one factor for each channel.
+        exposure_value: The exposure as far as it is known: pixels = exposure_value × free factor × radiance.
+        max_pixels: Average blocks of pixels until no more than this many are used.
+        name: Of the image, in messages, tables and file names.
+    """
+    refuse = _Refusal(name)
+    image = np.asarray(pixels)
+    if image.ndim != 3 or 0 in image.shape or not np.issubdtype(image.dtype, np.number):
+        refuse(f"pixels: got shape {image.shape} of {image.dtype}, expected numbers in the shape (height, width, channels)")
+    image = image.astype(np.float32)
+    directions = np.asarray(camera.directions(), dtype=np.float32)
+    if directions.shape[:2] != image.shape[:2]:
+        size = "{1} x {0}".format(*directions.shape[:2])
+        refuse(f"pixels: the image is {image.shape[1]} x {image.shape[0]} (width x height) and the camera {size}")
+    toward_sun = np.asarray(sun, dtype=np.float32)
+    if toward_sun.shape != (3,) or not np.all(np.isfinite(toward_sun)) or abs(np.linalg.norm(toward_sun) - 1) > 1e-3:
+        refuse(f"sun: got {np.asarray(sun).tolist()}, expected a unit vector towards the sun")
+    refuse.unless(altitude >= 0 and math.isfinite(altitude), "altitude", altitude, "kilometres >= 0")
+    refuse.unless(0 <= sun_exclusion < math.pi, "sun_exclusion", sun_exclusion, "radians from 0 to less than π")
+    refuse.unless(0 < view_zenith_max <= math.pi, "view_zenith_max", view_zenith_max, "radians, more than 0 and up to π")
+    refuse.unless(
+        0 <= horizon_exclusion < math.pi / 2, "horizon_exclusion", horizon_exclusion, "radians from 0 to less than π/2"
+    )
+    refuse.unless(
+        exposure_value > 0 and math.isfinite(exposure_value), "exposure_value", exposure_value, "a finite number > 0"
+    )
+    refuse.unless(saturation is None or saturation > 0, "saturation", saturation, "a number > 0")
+    refuse.unless(max_pixels >= 1, "max_pixels", max_pixels, "at least 1")
+    refuse.unless(bool(exposure.removesuffix(PER_CHANNEL)), "exposure", repr(exposure), '"fixed", "free" or a name')
+    refuse.unless(exposure != FIXED + PER_CHANNEL, "exposure", repr(exposure), '"fixed", "free" or a name')
+
+    inside = np.asarray(camera.valid(), dtype=bool)
+    zenith = np.arccos(np.clip(directions[..., 2], -1, 1))
+    from_sun = np.arccos(np.clip(directions @ toward_sun, -1, 1))
+    finite = np.all(np.isfinite(image), axis=-1)
+    # The tolerance keeps a pixel whose centre lies on the limit itself.
+    shown = inside & (zenith <= view_zenith_max + 1e-6)
+    steps: list[tuple[str, np.ndarray]] = [
+        ("outside the camera's field of view", ~inside),
+        ("beyond the largest view zenith angle", ~shown),
+        ("not finite", ~finite),
+        ("negative", np.any(image < 0, axis=-1)),
+        ("black", np.all(image == 0, axis=-1)),
+    ]
+    if saturation is not None:
+        steps.append(("saturated", np.any(image >= saturation, axis=-1)))
+    if mask is not None:
+        chosen = np.asarray(mask)
+        if chosen.shape != image.shape[:2]:
+            refuse(f"mask: got shape {chosen.shape}, expected {image.shape[:2]} like the image")
+        steps.append(("masked by the user", ~chosen.astype(bool)))
+    steps.append(("near the sun", from_sun < sun_exclusion))
+    steps.append(("near the horizon", np.abs(math.pi / 2 - zenith) < horizon_exclusion))
+    used = np.ones(image.shape[:2], dtype=bool)
+    masked: Counter[str] = Counter()
+    for reason, bad in steps:
+        if count := int(np.sum(used & bad)):
+            masked[reason] = count
+        used &= ~bad
+    if not used.any():
+        why = ", ".join(f"{count} {reason}" for reason, count in masked.items())
+        refuse(f"no pixel is left to fit: of {used.size} pixels {why}")
+
+    noises = {
+        "noise": _per_pixel(refuse, "noise", noise, image.shape),
+        "noise_shot": _per_pixel(refuse, "noise_shot", noise_shot, image.shape),
+        "noise_floor": _per_pixel(
+            refuse, "noise_floor", 1e-4 * np.median(image[used]) if noise_floor is None else noise_floor, image.shape
+        ),
+    }
+    if np.any(sum(value[used] for value in noises.values()) == 0):
+        refuse("noise: it is zero for some pixels, expected a standard deviation > 0")
+    block = math.ceil(math.sqrt(used.sum() / max_pixels))
+    fields: dict[str, Any] = {"image": image, "directions": directions, "shown": shown, "used": used, **noises}
+    return Observation(
+        name=name,
+        exposure=exposure,
+        exposure_value=float(exposure_value),
+        altitude=float(altitude),
+        sun=toward_sun / np.linalg.norm(toward_sun),
+        masked=dict(masked),
+        block=block,
+        **(fields if block == 1 else _bin(fields, block)),
+    )
+
+
+class _Refusal(NamedTuple):
+    """Raises errors that begin with the image's name."""
+
+    name: str
+
+    def __call__(self, message: str) -> None:
+        raise FitError(f"{self.name}: {message}")
+
+    def unless(self, good: bool, key: str, value: Any, expected: str) -> None:
+        if not good:
+            self(f"{key}: got {value}, expected {expected}")
+
+
+def _per_pixel(refuse: _Refusal, key: str, value: float | np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    array = np.asarray(value, dtype=np.float32)
+    if array.shape == shape[:2]:
+        array = array[..., None]
+    try:
+        array = np.broadcast_to(array, shape)
+    except ValueError:
+        refuse(f"{key}: got shape {array.shape}, expected one number, or one per channel or pixel of {shape}")
+    if not np.all(np.isfinite(array)) or np.any(array < 0):
+        refuse(f"{key}: expected finite numbers >= 0")
+    return array
+
+
+def _bin(fields: dict[str, np.ndarray], block: int) -> dict[str, np.ndarray]:
+    """Averages over ``block`` x ``block`` pixels; of used pixels where the block has any, else of those shown."""
+
+    def blocks(x: np.ndarray) -> np.ndarray:
+        height, width = x.shape[:2]
+        padding = [(0, -height % block), (0, -width % block)] + [(0, 0)] * (x.ndim - 2)
+        x = np.pad(x, padding)
+        rows, columns = x.shape[0] // block, x.shape[1] // block
+        return x.reshape(rows, block, columns, block, *x.shape[2:]).swapaxes(1, 2)
+
+    split = {key: blocks(value) for key, value in fields.items()}
+    used, shown = split["used"].any((2, 3)), split["shown"].any((2, 3))
+    chosen = np.where(used[..., None, None], split["used"], split["shown"])
+    count = np.maximum(chosen.sum((2, 3)), 1)
+
+    def mean(key: str) -> np.ndarray:
+        finite = np.where(chosen[..., None], np.nan_to_num(split[key]), 0)
+        return finite.sum((2, 3), dtype=np.float64) / count[..., None]
+
+    directions = mean("directions")
+    directions /= np.maximum(np.linalg.norm(directions, axis=-1, keepdims=True), 1e-6)
+    directions[~shown] = (0, 0, 1)
+    # Variances of independent pixels add, those of their mean are divided by the number squared.
+    signal = np.maximum(mean("image"), 1e-30)
+    squares = np.where(chosen[..., None], np.nan_to_num(split["noise"] * split["image"]) ** 2, 0)
+    relative = np.sqrt(squares.sum((2, 3), dtype=np.float64)) / count[..., None] / signal
+    dark = np.where(chosen[..., None], split["noise_floor"] ** 2, 0).sum((2, 3), dtype=np.float64)
+    binned = {
+        "image": mean("image"),
+        "directions": directions,
+        "noise": relative,
+        "noise_shot": mean("noise_shot") / count[..., None],
+        "noise_floor": np.sqrt(dark) / count[..., None],
+    }
+    return {key: value.astype(np.float32) for key, value in binned.items()} | {"used": used, "shown": shown}
+
+
+class Batch(eqx.Module):
+    """Several observations in arrays of one shape; ``pixel`` runs over those shown, padded with unused ones."""
+
+    altitude: Float[Array, " image"]
+    sun: Float[Array, "image 3"]
+    directions: Float[Array, "image pixel 3"]
+    measured: Float[Array, "image pixel w"]
+    used: Bool[Array, "image pixel"]
+    noise: Float[Array, "image pixel w"]
+    noise_shot: Float[Array, "image pixel w"]
+    noise_floor: Float[Array, "image pixel w"]
+    exposure_value: Float[Array, " image"]
+    exposure_index: Int[Array, "image w"]
+    exposure_count: int = eqx.field(static=True)
+
+    def exposure(self, log_factors: Float[Array, " e"]) -> Float[Array, "image 1 w"]:
+        """What radiance is multiplied by, from the logarithms of the free factors."""
+        logs = jnp.concatenate([log_factors, jnp.zeros(1, log_factors.dtype)])
+        return (self.exposure_value[:, None] * jnp.exp(logs[self.exposure_index]))[:, None]
+
+    def sigma(self, signal: Float[Array, "image pixel w"]) -> Float[Array, "image pixel w"]:
+        """Standard deviation of pixels with the expected value ``signal``."""
+        positive = jnp.maximum(signal, 0)
+        return jnp.sqrt((self.noise * positive) ** 2 + self.noise_shot * positive + self.noise_floor**2)
+
+
+def exposures(observations: Sequence[Observation], wavelengths: Sequence[float]) -> tuple[list[str], np.ndarray]:
+    """Names of the free exposure factors, and for each image and channel the factor's number, -1 where it is fixed."""
+    factors: dict[tuple[bool, str], int] = {}
+    index = np.full((len(observations), len(wavelengths)), -1)
+    for image, observation in enumerate(observations):
+        if observation.exposure == FIXED:
+            continue
+        own = observation.exposure.removesuffix(PER_CHANNEL)
+        base = observation.name if own == FREE else own
+        for channel, nm in enumerate(wavelengths):
+            name = f"{base}_{nm:g}" if observation.exposure.endswith(PER_CHANNEL) else base
+            index[image, channel] = factors.setdefault((own == FREE, f"exposure_{name}"), len(factors))
+    names = [name for _, name in factors]
+    if len(set(names)) < len(names):
+        raise FitError("exposure: a group has the name of an image with a free exposure; rename the group")
+    return names, index
+
+
+def stack(observations: Sequence[Observation], wavelengths: Sequence[float]) -> Batch:
+    """The observations as one batch; raises :class:`FitError` if they do not go together."""
+    if not observations:
+        raise FitError("no observation was given")
+    seen = Counter(observation.name for observation in observations)
+    for name, count in seen.items():
+        if count > 1:
+            raise FitError(f"{name}: the name of {count} observations, expected different names")
+    for observation in observations:
+        channels = observation.image.shape[-1]
+        if channels != len(wavelengths):
+            given = ", ".join(f"{nm:g}" for nm in wavelengths)
+            raise FitError(
+                f"{observation.name}: the image has {channels} channels, expected {len(wavelengths)}, one for each "
+                f"wavelength of the atmosphere ({given} nm)"
+            )
+    names, index = exposures(observations, wavelengths)
+    size = max(int(observation.shown.sum()) for observation in observations)
+
+    def padded(field: str, fill: Any) -> Array:
+        rows = []
+        for observation in observations:
+            value = getattr(observation, field)[observation.shown]
+            rows.append(np.concatenate([value, np.broadcast_to(fill, (size - len(value), *value.shape[1:]))]))
+        return number(np.stack(rows))
+
+    def number(value: Any) -> Array:
+        array = np.asarray(value)
+        return jnp.asarray(array, dtype=bool if array.dtype == bool else jnp.result_type(float))
+
+    return Batch(
+        altitude=number([observation.altitude for observation in observations]),
+        sun=number(np.stack([observation.sun for observation in observations])),
+        directions=padded("directions", np.array([0, 0, 1], dtype=np.float32)),
+        measured=jnp.nan_to_num(padded("image", np.float32(0)), posinf=0.0, neginf=0.0),
+        used=padded("used", False),
+        noise=padded("noise", np.float32(0)),
+        noise_shot=padded("noise_shot", np.float32(0)),
+        noise_floor=padded("noise_floor", np.float32(1)),
+        exposure_value=number([observation.exposure_value for observation in observations]),
+        exposure_index=jnp.asarray(index),
+        exposure_count=len(names),
+    )
+
+
+def unstack(observation: Observation, values: Float[np.ndarray, "pixel w"]) -> Float[np.ndarray, "height width w"]:
+    """Values of the shown pixels of one observation on its grid, NaN elsewhere."""
+    grid = np.full((*observation.shown.shape, values.shape[-1]), np.nan, dtype=np.float32)
+    grid[observation.shown] = values[: int(observation.shown.sum())]
+    return grid

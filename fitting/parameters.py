@@ -1,0 +1,331 @@
+"""Which numbers of an atmosphere are free, and the unbounded coordinates in which they are solved for.
+
+The solver knows no bounds, so it works in coordinates ``y`` that may be any real number, and a bijection maps each to a value
+in its range. One unit of ``y`` is about one natural step of the value (a factor e, or one typical size), so that the
+damping of Levenberg-Marquardt, which is isotropic in ``y``, restrains all parameters alike:
+
+==================================  =======================================================================
+range                               bijection
+==================================  =======================================================================
+value > lower                       :class:`Log`
+value >= 0, and 0 is quite likely   :class:`Softplus`: linear at typical sizes, flattening only close to zero
+lower < value < upper               :class:`Logit`
+==================================  =======================================================================
+
+A start value on its bound, where a bijection has no finite coordinate, is moved inside by a small fraction of its range.
+"""
+
+import difflib
+import math
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, TypeAlias
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from diffatmo.atmosphere import FILE_KEYS, SPECTRAL, Atmosphere
+from diffatmo.numerics import safe_divide
+from fitting._errors import FitError
+
+Coordinates = Float[Array, " n"]
+
+
+class Bijection(eqx.Module):
+    """A smooth increasing map from the real line onto the range of a value, element by element."""
+
+    @abstractmethod
+    def value(self, y: Float[Array, "..."]) -> Float[Array, "..."]:
+        """The value at coordinate ``y``."""
+
+    @abstractmethod
+    def coordinate(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
+        """The coordinate of ``value``, which is first moved inside its range if it lies on the bound."""
+
+    @abstractmethod
+    def side(self, y: Float[Array, "..."]) -> Int[Array, "..."]:
+        """-1 or +1 where the value is as good as at its lower or upper bound, else 0."""
+
+
+class Log(Bijection):
+    """value = lower + unit exp(y)."""
+
+    lower: Float[Array, "..."]
+    unit: Float[Array, "..."]
+
+    def value(self, y):
+        return self.lower + self.unit * jnp.exp(y)
+
+    def coordinate(self, value):
+        return jnp.log((value - self.lower) / self.unit)
+
+    def side(self, y):
+        return jnp.where(y < math.log(1e-3), -1, 0)
+
+
+class Softplus(Bijection):
+    """value = KNEE unit ln(1 + exp(y / KNEE)): about ``unit`` times y, bent above zero below y = KNEE."""
+
+    unit: Float[Array, "..."]
+
+    KNEE = 0.1
+
+    def value(self, y):
+        return self.KNEE * self.unit * jax.nn.softplus(y / self.KNEE)
+
+    def coordinate(self, value):
+        bent = jnp.maximum(value / (self.KNEE * self.unit), math.log(2))
+        return self.KNEE * (bent + jnp.log(-jnp.expm1(-bent)))
+
+    def side(self, y):
+        return jnp.where(y < -4 * self.KNEE, -1, 0)
+
+
+class Logit(Bijection):
+    """value = lower + (upper - lower) / (1 + exp(-y)); a start closer to an end than ``margin`` of the width is moved."""
+
+    lower: Float[Array, "..."]
+    upper: Float[Array, "..."]
+    margin: float
+
+    def value(self, y):
+        return self.lower + (self.upper - self.lower) * jax.nn.sigmoid(y)
+
+    def coordinate(self, value):
+        fraction = jnp.clip((value - self.lower) / (self.upper - self.lower), self.margin, 1 - self.margin)
+        return jnp.log(fraction) - jnp.log1p(-fraction)
+
+    def side(self, y):
+        return jnp.where(jnp.abs(y) > 6, jnp.sign(y), 0).astype(int)
+
+
+class Quantity(NamedTuple):
+    """What a number of the result is: ``name`` is the field, and its wavelength in nm where it has one."""
+
+    name: str
+    field: str
+    wavelength: float | None
+    unit: str
+
+
+class Block(eqx.Module):
+    """One free field: its bijection and where it starts.
+
+    With ``ratios`` the coordinate is that of a common factor, and the field is the factor times the ratios.
+    """
+
+    field: str = eqx.field(static=True)
+    bijection: Bijection
+    start: Coordinates
+    ratios: Float[Array, " w"] | None
+
+    def value(self, y: Coordinates) -> Float[Array, "..."]:
+        """The field's value, in its own shape, at this block's coordinates."""
+        value = self.bijection.value(y)
+        if self.ratios is not None:
+            return value * self.ratios
+        return value if self.field in SPECTRAL else value[0]
+
+    @property
+    def spectral(self) -> bool:
+        """Whether each wavelength has its own coordinate."""
+        return self.field in SPECTRAL and self.ratios is None
+
+
+class Parameters(eqx.Module):
+    """The free parameters of one atmosphere, everything else being as in ``init``."""
+
+    init: Atmosphere
+    blocks: tuple[Block, ...]
+
+    @property
+    def size(self) -> int:
+        """Number of coordinates."""
+        return sum(block.start.size for block in self.blocks)
+
+    @property
+    def start(self) -> Coordinates:
+        """Coordinates of ``init`` (moved off the bounds)."""
+        return jnp.concatenate([block.start for block in self.blocks])
+
+    def _split(self, y: Coordinates) -> list[Coordinates]:
+        ends = np.cumsum([block.start.size for block in self.blocks])
+        return jnp.split(y, ends[:-1])
+
+    def atmosphere(self, y: Coordinates) -> Atmosphere:
+        """The atmosphere at coordinates ``y``."""
+        values = [block.value(part) for block, part in zip(self.blocks, self._split(y), strict=True)]
+        return eqx.tree_at(lambda a: [getattr(a, block.field) for block in self.blocks], self.init, values)
+
+    def side(self, y: Coordinates) -> Int[Array, " n"]:
+        """-1 or +1 for each coordinate whose value is as good as at its lower or upper bound, else 0."""
+        return jnp.concatenate([b.bijection.side(part) for b, part in zip(self.blocks, self._split(y), strict=True)])
+
+    def at_bound(self, y: Coordinates) -> Bool[np.ndarray, " q"]:
+        """Whether each number of the free fields is as good as at its bound, in the order of :func:`quantities`."""
+        sides = [b.bijection.side(part) for b, part in zip(self.blocks, self._split(y), strict=True)]
+        sizes = [jnp.size(getattr(self.init, block.field)) for block in self.blocks]
+        return np.concatenate([np.broadcast_to(side != 0, size) for side, size in zip(sides, sizes, strict=True)])
+
+    def colours(self) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"]]:
+        """The colouring of the Jacobian: for each coordinate the tangent it shares, and the one channel it touches.
+
+        Wavelengths do not mix in any model, so channel w of an image depends on number w of a spectral field only: all
+        wavelengths of a field share one tangent. A coordinate that touches every channel has channel -1.
+        """
+        colour, channel = [], []
+        for number, block in enumerate(self.blocks):
+            colour += [number] * block.start.size
+            channel += list(range(block.start.size)) if block.spectral else [-1]
+        return np.array(colour), np.array(channel)
+
+
+def spectral_name(name: str, wavelength: float) -> str:
+    """Name of one wavelength's number."""
+    return f"{name}_{wavelength:g}"
+
+
+_Choice: TypeAlias = Callable[[Atmosphere, Array], Bijection]
+"""The bijection of a field, from the atmosphere at the start and the field's value in it."""
+
+
+def _positive(typical: float) -> _Choice:
+    """Log from the start value; a field that starts at zero gets a softplus of ``typical`` size to leave it by."""
+
+    def choose(init: Atmosphere, value: Array) -> Bijection:
+        del init
+        if bool(jnp.all(value > 0)):
+            return Log(jnp.zeros_like(value), value)
+        return Softplus(jnp.full_like(value, max(typical, float(jnp.max(value)))))
+
+    return choose
+
+
+def _maybe_zero(typical: float) -> _Choice:
+    """Softplus, of the size of the start value where that is not zero."""
+
+    def choose(init: Atmosphere, value: Array) -> Bijection:
+        del init
+        largest = float(jnp.max(value))
+        return Softplus(jnp.full_like(value, largest if largest > 0 else typical))
+
+    return choose
+
+
+def _between(lower: float, upper: float, margin: float) -> _Choice:
+    return lambda init, value: Logit(jnp.full_like(value, lower), jnp.full_like(value, upper), margin)
+
+
+_CHOICES: dict[str, _Choice] = {
+    "solar_irradiance": _positive(1.0),
+    "bottom_radius": lambda init, value: Logit(jnp.zeros_like(value), init.top_radius[None], 1e-6),
+    "top_radius": lambda init, value: Log(init.bottom_radius[None], init.top_altitude[None]),
+    "rayleigh_scattering": _positive(1e-2),
+    "rayleigh_scale_height": _positive(8.0),
+    "mie_scattering": _positive(4e-3),
+    "mie_absorption": _maybe_zero(4e-4),
+    "mie_scale_height": _positive(1.2),
+    "mie_g": _between(-1.0, 1.0, 0.002),
+    "ozone_absorption": _maybe_zero(1e-3),
+    "ground_albedo": _between(0.0, 1.0, 0.05),
+    "ozone_center_altitude": _positive(25.0),
+    "ozone_half_width": _positive(15.0),
+}
+"""The fields that can be free. Typical sizes matter only to a field that starts at zero."""
+
+FREE_FIELDS = tuple(_CHOICES)
+"""Names of the fields that can be free."""
+
+
+def _unit(field: str) -> str:
+    return {"_km": "km", "_per_km": "1/km", "_nm": "nm"}.get(FILE_KEYS[field].removeprefix(field), "")
+
+
+def quantities(fields: Sequence[str], wavelengths: Sequence[float], unit: str | None = None) -> list[Quantity]:
+    """What each number of ``fields`` is, in order; spectral fields have one number per wavelength."""
+    result = []
+    for field in fields:
+        u = _unit(field) if unit is None else unit
+        if field in SPECTRAL or field in DERIVED:
+            result += [Quantity(spectral_name(field, nm), field, nm, u) for nm in wavelengths]
+        else:
+            result.append(Quantity(field, field, None, u))
+    return result
+
+
+DERIVED: dict[str, tuple[Callable[[Atmosphere], Float[Array, " w"]], tuple[str, ...]]] = {
+    "rayleigh_optical_depth": (
+        lambda a: a.rayleigh_optical_depth,
+        ("rayleigh_scattering", "rayleigh_scale_height"),
+    ),
+    "mie_optical_depth": (
+        lambda a: a.mie_optical_depth,
+        ("mie_scattering", "mie_absorption", "mie_scale_height"),
+    ),
+    "mie_single_scattering_albedo": (
+        lambda a: safe_divide(a.mie_scattering, a.mie_extinction),
+        ("mie_scattering", "mie_absorption"),
+    ),
+}
+"""Combinations that images determine better than their factors: name -> (function of the atmosphere, its ingredients)."""
+
+
+def derived_fields(free: Sequence[str]) -> list[str]:
+    """The derived quantities that vary when the fields ``free`` do."""
+    return [name for name, (_, ingredients) in DERIVED.items() if set(ingredients) & set(free)]
+
+
+def numbers(atmosphere: Atmosphere, fields: Sequence[str]) -> Float[Array, " q"]:
+    """The numbers of ``fields``, derived ones included, in the order of :func:`quantities`."""
+    values = [DERIVED[name][0](atmosphere) if name in DERIVED else getattr(atmosphere, name) for name in fields]
+    return jnp.concatenate([jnp.atleast_1d(value) for value in values])
+
+
+def _unknown(name: Any, allowed: Sequence[str]) -> str:
+    close = difflib.get_close_matches(str(name), allowed, n=1)
+    hint = f"; did you mean {close[0]!r}?" if close else ""
+    return f"{name!r} cannot be free{hint} (possible: {', '.join(allowed)})"
+
+
+def select(init: Atmosphere, free: Sequence[str], scaled: Sequence[str] = ()) -> Parameters:
+    """Make the fields ``free`` of ``init`` free.
+
+    A spectral field is free at every wavelength, or, if it is in ``scaled`` as well, by one factor that keeps the ratios of
+    ``init``. Raises :class:`FitError` for a name that cannot be free.
+    """
+    if isinstance(free, str) or isinstance(scaled, str):
+        raise FitError("free: got one string, expected a list of names")
+    for name in free:
+        if name not in _CHOICES:
+            raise FitError(f"free: {_unknown(name, FREE_FIELDS)}")
+    if not free:
+        raise FitError(f"free: no parameter given; possible are {', '.join(FREE_FIELDS)}")
+    repeated = sorted({name for name in free if list(free).count(name) > 1})
+    if repeated:
+        raise FitError(f"free: {repeated[0]!r} is given twice")
+    if {"bottom_radius", "top_radius"} <= set(free):
+        raise FitError("free: bottom_radius and top_radius bound each other; free only one of them")
+    for name in scaled:
+        if name not in free:
+            raise FitError(f"scaled: {name!r} is not among the free parameters ({', '.join(free)})")
+        if name not in SPECTRAL:
+            raise FitError(f"scaled: {name!r} has no wavelengths to scale together")
+    return Parameters(init, tuple(_block(init, name, name in scaled) for name in free))
+
+
+def _block(init: Atmosphere, field: str, scaled: bool) -> Block:
+    value = jnp.atleast_1d(getattr(init, field))
+    if not scaled:
+        bijection = _CHOICES[field](init, value)
+        return Block(field, bijection, bijection.coordinate(value), None)
+    largest = jnp.max(value)
+    if largest == 0:
+        raise FitError(f"scaled: {field!r} starts at zero at every wavelength, so no factor can change it")
+    one = jnp.ones_like(value, shape=(1,))
+    factor: Bijection = Log(jnp.zeros_like(one), one)
+    if field == "ground_albedo":
+        factor = Logit(jnp.zeros_like(one), one / largest, 0.05)
+    return Block(field, factor, factor.coordinate(one), value)

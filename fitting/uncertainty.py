@@ -1,0 +1,262 @@
+"""Error bars: what the images determine, how well, and what they do not.
+
+Around the optimum the whitened residuals are linear in the coordinates y, so the covariance of y is (JᵀJ)⁻¹ = (RᵀR)⁻¹, with
+R from the last step of the solution; that of the physical numbers q(y) is G (JᵀJ)⁻¹ Gᵀ with G = dq/dy (the delta method).
+This linear algebra is a few numbers only and is done in float64 on the host, on columns scaled to length one.
+
+A combination of coordinates that changes no residual beyond rounding is not determined: it is left out of the inverse, and
+every number that would move along it gets no standard error at all.
+
+Standard errors are multiplied by √(reduced χ²) where that exceeds one, as the Particle Data Group does: if the residuals are
+larger than the stated noise, either the noise is understated or the model does not describe the image, and neither leaves
+room for more confidence.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from diffatmo.atmosphere import Atmosphere
+from diffatmo.models.base import Model
+from fitting._errors import FitError
+from fitting.observation import Observation, unstack
+from fitting.parameters import Coordinates, derived_fields, numbers, quantities
+from fitting.solve import MAX_STEPS, TOLERANCE, Progress, Solution, Step, solve
+
+RANK_TOLERANCE = 10 * float(np.finfo(np.float32).eps)
+"""Singular values of the scaled R below this are rounding: J is computed in float32."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A number with its error bar; ``standard_error`` is None where the images do not determine it.
+
+    ``field`` and ``wavelength`` (nm) say what ``name`` stands for; ``derived`` marks combinations of fitted numbers, and
+    ``at_bound`` values held by the edge of their range, whose error bar only tells how sharp the edge is approached.
+    """
+
+    name: str
+    field: str
+    wavelength: float | None
+    unit: str
+    value: float
+    standard_error: float | None
+    initial: float | None
+    truth: float | None = None
+    derived: bool = False
+    at_bound: bool = False
+
+    @property
+    def pull(self) -> float | None:
+        """(value - truth) / standard error."""
+        if self.truth is None or not self.standard_error:
+            return None
+        return (self.value - self.truth) / self.standard_error
+
+
+@dataclass(frozen=True)
+class FitResult:
+    """What a fit found. Arrays are NumPy's; ``covariance`` belongs to the numbers named in ``covariance_names``.
+
+    Covariances of numbers that the images do not determine are NaN. ``fitted`` are the expected images in the units of the
+    measured ones (NaN outside the fitted region), ``observations`` the images as they were fitted.
+    """
+
+    atmosphere: Atmosphere
+    parameters: list[Estimate]
+    exposures: list[Estimate]
+    covariance: Float[np.ndarray, "q q"]
+    covariance_names: list[str]
+    chi2: float
+    degrees_of_freedom: int
+    error_scale: float
+    iterations: int
+    converged: bool
+    message: str
+    history: list[Step]
+    timings: dict[str, float]
+    observations: list[Observation]
+    fitted: list[Float[np.ndarray, "height width w"]]
+    undetermined: list[str] = field(default_factory=list)
+
+    @property
+    def reduced_chi2(self) -> float:
+        """χ² per degree of freedom: 1 if the model and the stated noise explain the images."""
+        return self.chi2 / max(self.degrees_of_freedom, 1)
+
+    @property
+    def correlation(self) -> Float[np.ndarray, "q q"]:
+        """Correlation matrix of the numbers named in ``covariance_names``; NaN for those without an error."""
+        return correlation(self.covariance)
+
+    @property
+    def residuals(self) -> list[Float[np.ndarray, "height width w"]]:
+        """measured / fitted - 1 of each image, NaN where a pixel was not used."""
+        result = []
+        for observation, image in zip(self.observations, self.fitted, strict=True):
+            known = observation.used[..., None] & (image > 0)
+            result.append(np.where(known, observation.image / np.where(known, image, 1) - 1, np.nan).astype(np.float32))
+        return result
+
+    def estimate(self, name: str) -> Estimate:
+        """The parameter, derived quantity or exposure called ``name``."""
+        for estimate in [*self.parameters, *self.exposures]:
+            if estimate.name == name:
+                return estimate
+        raise KeyError(name)
+
+    def with_truth(self, truth: Atmosphere) -> "FitResult":
+        """The same result with the true value beside each parameter; raises :class:`FitError` for other wavelengths."""
+        own = np.asarray(self.atmosphere.wavelengths)
+        if truth.wavelengths.shape != own.shape or not np.allclose(truth.wavelengths, own):
+            raise FitError(f"truth: has wavelengths {truth.wavelengths.tolist()}, the fit {own.tolist()}")
+        fields = list(dict.fromkeys(estimate.field for estimate in self.parameters))
+        values = np.asarray(numbers(truth, fields), dtype=float)
+        return replace(
+            self, parameters=[replace(e, truth=float(v)) for e, v in zip(self.parameters, values, strict=True)]
+        )
+
+
+def correlation(covariance: Float[np.ndarray, "q q"]) -> Float[np.ndarray, "q q"]:
+    """Covariance divided by both standard deviations; NaN where a variance is zero or unknown."""
+    deviation = np.sqrt(np.diag(covariance))
+    deviation = np.where(deviation > 0, deviation, np.nan)
+    return covariance / np.outer(deviation, deviation)
+
+
+def propagate(
+    factor: Float[np.ndarray, "n n"], gradient: Float[np.ndarray, "q n"]
+) -> tuple[Float[np.ndarray, "q q"], np.ndarray]:
+    """Covariance G (RᵀR)⁻¹ Gᵀ from ``factor`` R and ``gradient`` G, and which of the numbers are determined at all.
+
+    Rows and columns of the others are NaN.
+    """
+    length = np.linalg.norm(factor, axis=0)
+    scale = np.where(length > 0, length, 1)
+    _, singular, right = np.linalg.svd(factor / scale)
+    seen = singular > RANK_TOLERANCE * max(singular.max(), 1e-300)
+    scaled = gradient / scale
+    size = np.linalg.norm(scaled, axis=1)
+    # A number that moves along an unseen direction by more than rounding is not determined.
+    unseen = np.linalg.norm(scaled @ right[~seen].T, axis=1)
+    determined = unseen <= 1e-3 * np.where(size > 0, size, 1)
+    half = scaled @ right[seen].T / singular[seen]
+    covariance = half @ half.T
+    covariance[~determined] = np.nan
+    covariance[:, ~determined] = np.nan
+    return covariance, determined
+
+
+def summarise(solution: Solution, observations: Sequence[Observation]) -> FitResult:
+    """Attach error bars to ``solution``."""
+    parameters = solution.parameters
+    count = parameters.size
+    wavelengths = [float(nm) for nm in parameters.init.wavelengths]
+    free = [block.field for block in parameters.blocks]
+    derived = derived_fields(free)
+    fitted_quantities = quantities(free, wavelengths)
+    all_quantities = fitted_quantities + quantities(derived, wavelengths)
+
+    def physical(y: Coordinates) -> Float[np.ndarray, " q"]:
+        return jnp.concatenate([numbers(parameters.atmosphere(y[:count]), free + derived), jnp.exp(y[count:])])
+
+    values = np.asarray(physical(solution.y), dtype=float)
+    gradient = np.asarray(jax.jacfwd(physical)(solution.y), dtype=float)
+    covariance, determined = propagate(solution.triangle[:-1, :-1], gradient)
+    reduced_chi2 = solution.chi2 / max(solution.degrees_of_freedom, 1)
+    scale = max(1.0, math.sqrt(reduced_chi2))
+    covariance *= scale**2
+    errors = [math.sqrt(v) if ok else None for v, ok in zip(np.diag(covariance), determined, strict=True)]
+    initial = np.asarray(numbers(parameters.init, free + derived), dtype=float)
+    at_bound = parameters.at_bound(solution.y[:count])
+
+    estimates = [
+        Estimate(
+            name=quantity.name,
+            field=quantity.field,
+            wavelength=quantity.wavelength,
+            unit=quantity.unit,
+            value=values[i],
+            standard_error=errors[i],
+            initial=float(initial[i]),
+            derived=i >= len(fitted_quantities),
+            at_bound=i < len(fitted_quantities) and bool(at_bound[i]),
+        )
+        for i, quantity in enumerate(all_quantities)
+    ]
+    factors = [
+        Estimate(name, name, None, "", values[i], errors[i], None)
+        for i, name in enumerate(solution.exposure_names, start=len(all_quantities))
+    ]
+    reported = [*range(len(fitted_quantities)), *range(len(all_quantities), len(values))]
+    return FitResult(
+        atmosphere=parameters.atmosphere(solution.y[:count]),
+        parameters=estimates,
+        exposures=factors,
+        covariance=covariance[np.ix_(reported, reported)],
+        covariance_names=[quantity.name for quantity in fitted_quantities] + solution.exposure_names,
+        chi2=solution.chi2,
+        degrees_of_freedom=solution.degrees_of_freedom,
+        error_scale=scale,
+        iterations=len(solution.history),
+        converged=solution.converged,
+        message=solution.message,
+        history=solution.history,
+        timings=solution.timings,
+        observations=list(observations),
+        fitted=[unstack(o, image) for o, image in zip(observations, solution.predicted, strict=True)],
+        undetermined=[e.name for e in [*estimates, *factors] if e.standard_error is None],
+    )
+
+
+def fit(
+    observations: Sequence[Observation],
+    *,
+    init: Atmosphere,
+    free: Sequence[str],
+    scaled: Sequence[str] = (),
+    model: Model | None = None,
+    progress: Progress | None = None,
+    max_steps: int = MAX_STEPS,
+    tolerance: float = TOLERANCE,
+) -> FitResult:
+    """Recover an atmosphere's parameters from images of its sky, with error bars.
+
+    Args:
+        observations: From :func:`fitting.observe`; all are explained by the one atmosphere.
+        init: Where the search starts, and the value of everything that is not free.
+        free: Names of the fields of :class:`~diffatmo.atmosphere.Atmosphere` to recover; a spectral field is free at every
+            wavelength.
+        scaled: Those of the spectral ones of which only a common factor is free.
+        model: How the sky is computed, :class:`~diffatmo.models.moments.Moments` by default.
+        progress: Called after each step.
+        max_steps: Evaluations of the model with its derivatives before the fit gives up.
+        tolerance: Squared distance to the optimum, in standard errors, at which it is found.
+
+    Returns:
+        The best point found; ``converged`` and ``message`` say whether it is the optimum and why the fit stopped.
+
+    Raises:
+        FitError: The fit cannot be started: a name that is not a parameter, images that do not go together, a model that is
+            not finite at the start.
+    """
+    if model is None:
+        from diffatmo.models import Moments
+        model = Moments()
+
+    solution = solve(
+        observations,
+        init=init,
+        free=free,
+        scaled=scaled,
+        model=model,
+        progress=progress,
+        max_steps=max_steps,
+        tolerance=tolerance,
+    )
+    return summarise(solution, observations)

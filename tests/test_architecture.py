@@ -1,0 +1,132 @@
+"""The layering: every module imports only from the levels above it in the table, and `--help` imports almost nothing."""
+
+import ast
+import subprocess
+import sys
+import time
+import tomllib
+from pathlib import Path
+
+import pytest
+
+import diffatmo
+from diffatmo.cli import common
+
+ROOT = Path(__file__).parent.parent
+
+# One row per level; a module may import from any earlier row, never from its own. Packages listed by their own name mean
+# their __init__.py.
+LEVELS = [
+    ["diffatmo._types", "diffatmo.constants"],
+    ["diffatmo.numerics"],
+    ["diffatmo.geometry", "diffatmo.phase", "diffatmo.table", "diffatmo.spectrum", "diffatmo.color"]
+    + ["diffatmo.camera", "diffatmo.sun"],
+    ["diffatmo.rays", "diffatmo.atmosphere"],
+    ["diffatmo.transmittance"],
+    ["diffatmo.models.base"],
+    ["diffatmo.models.raymarch", "diffatmo.models.moments", "diffatmo.models.pathtrace"],
+    ["diffatmo.models"],
+    ["diffatmo.render", "diffatmo.imageio"],
+    ["fitting.parameters", "fitting.observation"],
+    ["fitting.residuals"],
+    ["fitting.solve"],
+    ["fitting.uncertainty"],
+    ["fitting.report"],
+    ["fitting"],
+    ["diffatmo"],  # the lazy public interface
+    ["diffatmo.cli", "diffatmo.cli.common"],
+    ["diffatmo.cli.scene", "diffatmo.cli.shipped"],
+    ["diffatmo.cli.images"],
+    ["diffatmo.cli.radiance", "diffatmo.cli.render", "diffatmo.cli.fit"],
+    ["diffatmo.cli.main"],
+    ["diffatmo.__main__"],
+]
+LEVEL = {module: number for number, modules in enumerate(LEVELS) for module in modules}
+
+
+def modules() -> dict[str, Path]:
+    found = {}
+    for package in ("diffatmo", "fitting"):
+        for path in sorted((ROOT / package).rglob("*.py")):
+            parts = path.relative_to(ROOT).with_suffix("").parts
+            found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    return found
+
+
+MODULES = modules()
+
+
+def imports(path: Path) -> set[str]:
+    """The project's modules that the file at `path` imports, anywhere in it."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            names = {f"{node.module}.{alias.name}" for alias in node.names}
+            found |= {name if name in MODULES else node.module for name in names}
+    return {name for name in found if name.split(".")[0] in ("diffatmo", "fitting")}
+
+
+def test_every_module_has_a_level():
+    assert set(MODULES) == set(LEVEL)
+
+
+@pytest.mark.parametrize("module", [name for name in MODULES if name != "diffatmo"])
+def test_imports_point_down(module):
+    above = {name for name in imports(MODULES[module]) if LEVEL[name] >= LEVEL[module]}
+    assert not above, f"{module} may not import {sorted(above)}"
+
+
+@pytest.mark.parametrize("module", [name for name in MODULES if name.startswith("diffatmo")])
+def test_only_the_command_line_sees_fitting(module):
+    if not module.startswith("diffatmo.cli"):
+        assert not {name for name in imports(MODULES[module]) if name.startswith("fitting")}
+
+
+def test_public_names_resolve():
+    for name in diffatmo.__all__:
+        assert getattr(diffatmo, name) is not None
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        diffatmo.nothing  # noqa: B018
+
+
+def test_model_names_of_the_command_line():
+    from diffatmo import models
+
+    assert common.MODELS == tuple(models.MODELS)
+
+
+def test_help_imports_no_jax():
+    code = (
+        "import sys; from diffatmo.cli.main import main; main(['fit', '--help']); "
+        "sys.exit(any(name in sys.modules for name in ('jax', 'numpy', 'rich', 'matplotlib')))"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, cwd=ROOT)
+
+
+def test_help_answers_within_half_a_second():
+    def seconds() -> float:
+        start = time.perf_counter()
+        subprocess.run([sys.executable, "-m", "diffatmo", "--help"], check=True, capture_output=True, cwd=ROOT)
+        return time.perf_counter() - start
+
+    # The best of five: the other tests share the machine.
+    assert min(seconds() for _ in range(5)) < 0.5
+
+
+def test_version_is_stated_once_and_repeated_truly():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    assert project["project"]["dynamic"] == ["version"]
+    assert f"\nversion: {diffatmo.__version__}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    assert f"\n## {diffatmo.__version__}" in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+
+
+def test_constraints_cover_every_dependency():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    extras = [name for group in project["optional-dependencies"].values() for name in group]
+    needed = {name.split(">=")[0].lower() for name in project["dependencies"] + extras} - {"diffatmo[test]"}
+    lines = (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
+    pinned = {line.split("==")[0].lower().replace("_", "-") for line in lines if not line.startswith("#")}
+    assert needed <= pinned
