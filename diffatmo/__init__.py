@@ -1,15 +1,29 @@
 """Which atmosphere made this sky? A differentiable sky model in JAX.
 
-The names below are the public interface. They are imported when first used, so that ``import diffatmo`` costs nothing and
-``diffatmo --help`` answers at once.
+The names below are the public interface. They are imported when first used, so that ``import diffatmo`` costs nothing
+and ``diffatmo --help`` answers at once.
 """
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from diffatmo import atmosphere, camera, color, constants, geometry, imageio, models, numerics, phase
-    from diffatmo import render, spectrum, sun, transmittance
+    from diffatmo import (
+        atmosphere,
+        camera,
+        color,
+        constants,
+        geometry,
+        imageio,
+        models,
+        numerics,
+        phase,
+        render,
+        scene,
+        spectrum,
+        sun,
+        transmittance,
+    )
     from diffatmo.atmosphere import Atmosphere, AtmosphereError, earth, load, mars, save
     from diffatmo.camera import Camera, Equirectangular, Fisheye, Pinhole
     from diffatmo.imageio import ImageError
@@ -38,23 +52,7 @@ _HOME = {
     "mars": "atmosphere",
     "save": "atmosphere",
 }
-"""Public name -> the module it lives in."""
-
-_MODULES = (
-    "atmosphere",
-    "camera",
-    "color",
-    "constants",
-    "geometry",
-    "imageio",
-    "models",
-    "numerics",
-    "phase",
-    "render",
-    "spectrum",
-    "sun",
-    "transmittance",
-)
+"""Public class or function -> the module it lives in; every other public name is a module."""
 
 __all__ = [
     "Atmosphere",
@@ -86,6 +84,7 @@ __all__ = [
     "phase",
     "render",
     "save",
+    "scene",
     "spectrum",
     "sun",
     "transmittance",
@@ -93,10 +92,10 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    if name in _MODULES:
-        return import_module(f"diffatmo.{name}")
     if name in _HOME:
         return getattr(import_module(f"diffatmo.{_HOME[name]}"), name)
+    if name in __all__:
+        return import_module(f"diffatmo.{name}")
     raise AttributeError(f"module 'diffatmo' has no attribute {name!r}")
 
 

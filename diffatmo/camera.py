@@ -52,6 +52,16 @@ class Camera(eqx.Module):
     def _project(self, rays: Direction) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         """(x, y) of unit vectors in the camera's frame: finite, and outside the picture for what it cannot show."""
 
+    @property
+    @abstractmethod
+    def pixel_angle(self) -> float | Scalar:
+        """Angle, rad, from one row to the next at the centre of the picture."""
+
+    @property
+    def wraps(self) -> bool:
+        """Whether the last column borders on the first."""
+        return False
+
     @abstractmethod
     def solid_angles(self) -> Float[Array, "height width"]:
         """Solid angle of every pixel, sr."""
@@ -111,12 +121,18 @@ class Equirectangular(Camera):
         _check(self)
 
     @property
-    def _row_angle(self) -> float:
+    def pixel_angle(self) -> float:
+        """Angle, rad, from one row to the next."""
         return (np.pi / 2 if self.upper else np.pi) / self.height
+
+    @property
+    def wraps(self) -> bool:
+        """True: the picture is a full turn."""
+        return True
 
     def _rays(self, x: Float[Array, "..."], y: Float[Array, "..."]) -> Direction:
         azimuth = (x + 0.5) * (2 * np.pi / self.width)
-        zenith = (y + 0.5) * self._row_angle
+        zenith = (y + 0.5) * self.pixel_angle
         sine = jnp.sin(zenith)
         return jnp.stack(
             jnp.broadcast_arrays(sine * jnp.sin(azimuth), sine * jnp.cos(azimuth), jnp.cos(zenith)), axis=-1
@@ -128,12 +144,12 @@ class Equirectangular(Camera):
         north = jnp.where((east == 0) & (north == 0), 1, north)
         turns = jnp.mod(jnp.arctan2(east, north) / (2 * np.pi), 1)
         zenith = jnp.arctan2(safe_norm(rays[..., :2]), rays[..., 2])
-        return turns * self.width - 0.5, zenith / self._row_angle - 0.5
+        return turns * self.width - 0.5, zenith / self.pixel_angle - 0.5
 
     def solid_angles(self) -> Float[Array, "height width"]:
         """Solid angle of every pixel, sr: exact, 2π/width (cos θ_top - cos θ_bottom)."""
-        zenith = (_array(jnp.arange(self.height)) + 0.5) * self._row_angle
-        row = 2 * np.pi / self.width * 2 * np.sin(self._row_angle / 2) * jnp.sin(zenith)
+        zenith = (_array(jnp.arange(self.height)) + 0.5) * self.pixel_angle
+        row = 2 * np.pi / self.width * 2 * np.sin(self.pixel_angle / 2) * jnp.sin(zenith)
         return jnp.broadcast_to(row[:, None], (self.height, self.width))
 
 
@@ -156,7 +172,8 @@ class Fisheye(Camera):
         _check_angle(self, "fov", 360.0)
 
     @property
-    def _pixel_angle(self) -> Scalar:
+    def pixel_angle(self) -> Scalar:
+        """Angle, rad, between neighbouring pixels along a radius."""
         return self.fov / min(self.height, self.width)
 
     def _centred(
@@ -167,14 +184,14 @@ class Fisheye(Camera):
 
     def _rays(self, x: Float[Array, "..."], y: Float[Array, "..."]) -> Direction:
         right, up, distance = self._centred(x, y)
-        angle = distance * self._pixel_angle
+        angle = distance * self.pixel_angle
         # sin(angle) / distance, smooth through the centre.
-        sine = self._pixel_angle * jnp.sinc(angle / np.pi)
+        sine = self.pixel_angle * jnp.sinc(angle / np.pi)
         return jnp.stack([right * sine, jnp.broadcast_to(jnp.cos(angle), sine.shape), up * sine], axis=-1)
 
     def _project(self, rays: Direction) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         sine = safe_norm(rays[..., ::2])
-        per_sine = safe_divide(jnp.arctan2(sine, rays[..., 1]), sine, 1.0) / self._pixel_angle
+        per_sine = safe_divide(jnp.arctan2(sine, rays[..., 1]), sine, 1.0) / self.pixel_angle
         return rays[..., 0] * per_sine + (self.width - 1) / 2, (self.height - 1) / 2 - rays[..., 2] * per_sine
 
     def _covers(self, x: Float[Array, "..."], y: Float[Array, "..."]) -> Bool[Array, "..."]:
@@ -184,7 +201,7 @@ class Fisheye(Camera):
     def solid_angles(self) -> Float[Array, "height width"]:
         """Solid angle of every pixel, sr, by its value at the pixel's centre."""
         _, _, distance = self._centred(*self._grid())
-        return self._pixel_angle**2 * jnp.sinc(distance * self._pixel_angle / np.pi)
+        return self.pixel_angle**2 * jnp.sinc(distance * self.pixel_angle / np.pi)
 
 
 class Pinhole(Camera):
@@ -202,12 +219,13 @@ class Pinhole(Camera):
         _check_angle(self, "fov_y", 179.0)
 
     @property
-    def _pixel_tangent(self) -> Scalar:
+    def pixel_angle(self) -> Scalar:
+        """Angle, rad, between neighbouring pixels at the centre (their distance on a screen at distance 1)."""
         return jnp.tan(self.fov_y / 2) * (2 / self.height)
 
     def _plane(self, x: Float[Array, "..."], y: Float[Array, "..."]) -> Float[Array, "... 3"]:
-        right = (x - (self.width - 1) / 2) * self._pixel_tangent
-        up = ((self.height - 1) / 2 - y) * self._pixel_tangent
+        right = (x - (self.width - 1) / 2) * self.pixel_angle
+        up = ((self.height - 1) / 2 - y) * self.pixel_angle
         return jnp.stack(jnp.broadcast_arrays(right, jnp.ones_like(right), up), axis=-1)
 
     def _rays(self, x: Float[Array, "..."], y: Float[Array, "..."]) -> Direction:
@@ -217,14 +235,14 @@ class Pinhole(Camera):
     def _project(self, rays: Direction) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         forward = rays[..., 1]
         ahead = forward > jnp.finfo(rays.dtype).eps
-        scale = 1 / (jnp.where(ahead, forward, 1) * self._pixel_tangent)
+        scale = 1 / (jnp.where(ahead, forward, 1) * self.pixel_angle)
         x = rays[..., 0] * scale + (self.width - 1) / 2
         y = (self.height - 1) / 2 - rays[..., 2] * scale
         return jnp.where(ahead, x, -2.0 * self.width), jnp.where(ahead, y, -2.0 * self.height)
 
     def solid_angles(self) -> Float[Array, "height width"]:
         """Solid angle of every pixel, sr, by its value at the pixel's centre."""
-        return self._pixel_tangent**2 / safe_norm(self._plane(*self._grid())) ** 3
+        return self.pixel_angle**2 / safe_norm(self._plane(*self._grid())) ** 3
 
 
 def _check(camera: Camera) -> None:

@@ -42,7 +42,10 @@ def rule(count: int, dtype: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     t, w = gauss_legendre(count)
     coefficients = np.linalg.inv(np.polynomial.legendre.legvander(2 * t - 1, count - 1))
     integral = np.stack(
-        [np.polynomial.legendre.legval(2 * t - 1, np.polynomial.legendre.legint(row, lbnd=-1)) for row in np.eye(count)],
+        [
+            np.polynomial.legendre.legval(2 * t - 1, np.polynomial.legendre.legint(row, lbnd=-1))
+            for row in np.eye(count)
+        ],
         axis=-1,
     )
     return t.astype(dtype), w.astype(dtype), (0.5 * integral @ coefficients).astype(dtype)
@@ -67,9 +70,7 @@ def _piece(
     return altitude, v_here * root, slope
 
 
-def shadow_crossings(
-    altitude: Altitude, mu: Cosine, mu_s: Cosine, nu: Cosine, radius: Scalar
-) -> tuple[Length, Length]:
+def shadow_crossings(altitude: Altitude, mu: Cosine, mu_s: Cosine, nu: Cosine, radius: Scalar) -> tuple[Length, Length]:
     """Distances at which the ray's line enters and leaves the planet's shadow, km; negative where it does not.
 
     The shadow is the half-cylinder of radius R behind the planet: distance from the sun's axis R, behind the terminator.
@@ -158,9 +159,7 @@ def trace(
     return Nodes(*(jnp.concatenate(parts, axis=-1) for parts in (altitudes, distances, weights)))
 
 
-def straight(
-    altitude: Altitude, mu: Cosine, length: Length, radius: Scalar, steps: int
-) -> Nodes:
+def straight(altitude: Altitude, mu: Cosine, length: Length, radius: Scalar, steps: int) -> Nodes:
     """Nodes on the first ``length`` km of a ray: one piece, Gauss-Legendre in distance."""
     t, w, _ = rule(steps, length.dtype.name)
     distance = length[..., None] * t
@@ -168,13 +167,14 @@ def straight(
     return Nodes(jnp.maximum(there, 0), distance, jnp.broadcast_to(length[..., None] * w, distance.shape))
 
 
-def accumulate(values: Float[Array, "... n c"], nodes: Nodes, steps: int) -> tuple[Float[Array, "... n c"], Float[Array, "... c"]]:
+def accumulate(
+    values: Float[Array, "... n"], nodes: Nodes, steps: int
+) -> tuple[Float[Array, "... n"], Float[Array, "..."]]:
     """Integrals of ``values`` from the start of the ray to each node, and to its end."""
     _, w, cumulative = rule(steps, values.dtype.name)
     pieces = nodes.weight.shape[-1] // steps
-    per_unit = values * (nodes.weight / np.tile(w, pieces))[..., None]
-    split = per_unit.reshape(*per_unit.shape[:-2], pieces, steps, per_unit.shape[-1])
-    within = jnp.einsum("nm,...pmc->...pnc", cumulative, split)
-    whole = jnp.einsum("m,...pmc->...pc", w, split)
-    before = jnp.cumsum(whole, axis=-2) - whole
-    return (within + before[..., None, :]).reshape(values.shape), jnp.sum(whole, axis=-2)
+    per_unit = (values * (nodes.weight / np.tile(w, pieces))).reshape(*values.shape[:-1], pieces, steps)
+    whole = per_unit @ w
+    before = jnp.cumsum(whole, axis=-1) - whole
+    within = per_unit @ cumulative.T
+    return (within + before[..., None]).reshape(values.shape), jnp.sum(whole, axis=-1)

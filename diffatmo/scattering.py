@@ -30,7 +30,6 @@ class Single(NamedTuple):
 
 def integrate(
     atmosphere: Atmosphere,
-    columns: transmittance.Columns,
     altitude: Altitude,
     mu: Cosine,
     mu_s: Cosine,
@@ -54,19 +53,19 @@ def integrate(
     mu_s_here = geometry.mu_s_along(
         altitude[..., None], mu[..., None], mu_s[..., None], nu[..., None], nodes.distance, radius
     )
-    towards_sun, free = columns(nodes.altitude, mu_s_here)
-    depth = transmittance.optical_depth(atmosphere, jnp.where(free[..., None], along + towards_sun, 0))
-    light = atmosphere.solar_irradiance * jnp.where(free[..., None], jnp.exp(-depth), 0)
-    density = transmittance.densities(atmosphere, nodes.altitude) * nodes.weight[..., None]
-    aerosol = light * density[..., 1, None]
-    repeated = []
-    forward = jnp.where(free, towards_sun[..., 1], 0)[..., None] * atmosphere.mie_scattering
-    term = aerosol
+    towards_sun, free = transmittance.to_top(atmosphere, nodes.altitude, mu_s_here)
+    both = transmittance.Columns(*(a + b for a, b in zip(along, towards_sun, strict=True)))
+    free = free[..., None]
+    depth = jnp.where(free, transmittance.optical_depth(atmosphere, both), 0)
+    light = atmosphere.solar_irradiance * jnp.where(free, jnp.exp(-depth), 0)
+    air = light * (nodes.weight * atmosphere.rayleigh_density(nodes.altitude))[..., None]
+    aerosol = light * (nodes.weight * atmosphere.mie_density(nodes.altitude))[..., None]
+    repeated, term = [], aerosol
     for order in range(1, aureole + 1):
-        term = term * forward / order
+        term = term * jnp.where(free, towards_sun.aerosol[..., None], 0) * (atmosphere.mie_scattering / order)
         repeated.append(atmosphere.mie_scattering * jnp.sum(term, axis=-2))
     return Single(
-        rayleigh=atmosphere.rayleigh_scattering * jnp.sum(light * density[..., 0, None], axis=-2),
+        rayleigh=atmosphere.rayleigh_scattering * jnp.sum(air, axis=-2),
         mie=atmosphere.mie_scattering * jnp.sum(aerosol, axis=-2),
         aureole=tuple(repeated),
         transmittance=jnp.exp(-transmittance.optical_depth(atmosphere, end)),

@@ -2,24 +2,27 @@
 
 :func:`observe` checks and prepares a single image, :func:`stack` puts several into arrays of one shape.
 
-*Noise.* A pixel of signal S (in the image's own units) has the variance ``(noise S)² + shot S + floor²``. Where S comes
-from is the business of :mod:`fitting.solve`; taking the noisy pixel itself would weight low outliers more than high ones.
+*Noise.* A pixel of signal S (in the image's own units) has the variance ``(noise S)² + shot S + floor²``. Where S
+comes from is the business of :mod:`fitting.solve`; taking the noisy pixel itself would weight low outliers more than
+high ones.
 
-*Large images* are averaged in square blocks until at most ``max_pixels`` remain; a block has the mean radiance and the mean
-direction of its unmasked pixels, and the noise of that mean. The radiance of the mean direction differs from the mean
-radiance by about (block width)² / 24 times the second derivative, which matters close to the sun and the horizon only.
+*Large images* are averaged in square blocks until at most ``max_pixels`` remain; a block has the mean radiance and
+the mean direction of its unmasked pixels, and the noise of that mean. The radiance of the mean direction differs from
+the mean radiance by about (block width)² / 24 times the second derivative, which matters close to the sun and the
+horizon only.
 """
 
 import math
 from collections import Counter
 from collections.abc import Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from diffatmo.camera import Camera
 from fitting._errors import FitError
 
 FIXED = "fixed"
@@ -29,16 +32,6 @@ PER_CHANNEL = "-per-channel"
 NOISE = 0.01
 MAX_PIXELS = 20_000
 SUN_EXCLUSION = math.radians(2.0)
-
-
-class Camera(Protocol):
-    """What is needed of a camera: a direction for every pixel, and which pixels see anything."""
-
-    def directions(self) -> Float[Array, "height width 3"]:
-        """Unit vector of each pixel's centre; x east, y north, z up."""
-
-    def valid(self) -> Bool[Array, "height width"]:
-        """Whether the pixel is inside the picture (a fisheye's circle)."""
 
 
 class Observation(eqx.Module):
@@ -58,6 +51,7 @@ class Observation(eqx.Module):
     noise_floor: Float[np.ndarray, "height width w"]
     masked: dict[str, int] = eqx.field(static=True)
     block: int = eqx.field(static=True)
+    camera: Camera
 
 
 def observe(
@@ -94,7 +88,8 @@ def observe(
         sun_exclusion: Radius, in radians, of the disc around the sun that is not used.
         view_zenith_max: Largest view zenith angle used, radians: π/2 for the sky alone, π for the ground too.
         horizon_exclusion: Elevations closer to 0 than this, radians, are not used.
-        exposure: ``"fixed"``, ``"free"`` (a factor of this image's own) or the name of a group of images that share one;
+        exposure: ``"fixed"``, ``"free"`` (a factor of this image's own) or the name of a group of images that share
+        one;
             with ``-per-channel`` appended (``"free-per-channel"``) there is one factor for each channel.
         exposure_value: The exposure as far as it is known: pixels = exposure_value × free factor × radiance.
         max_pixels: Average blocks of pixels until no more than this many are used.
@@ -103,7 +98,9 @@ def observe(
     refuse = _Refusal(name)
     image = np.asarray(pixels)
     if image.ndim != 3 or 0 in image.shape or not np.issubdtype(image.dtype, np.number):
-        refuse(f"pixels: got shape {image.shape} of {image.dtype}, expected numbers in the shape (height, width, channels)")
+        refuse(
+            f"pixels: got shape {image.shape} of {image.dtype}, expected numbers in the shape (height, width, channels)"
+        )
     image = image.astype(np.float32)
     directions = np.asarray(camera.directions(), dtype=np.float32)
     if directions.shape[:2] != image.shape[:2]:
@@ -114,7 +111,9 @@ def observe(
         refuse(f"sun: got {np.asarray(sun).tolist()}, expected a unit vector towards the sun")
     refuse.unless(altitude >= 0 and math.isfinite(altitude), "altitude", altitude, "kilometres >= 0")
     refuse.unless(0 <= sun_exclusion < math.pi, "sun_exclusion", sun_exclusion, "radians from 0 to less than π")
-    refuse.unless(0 < view_zenith_max <= math.pi, "view_zenith_max", view_zenith_max, "radians, more than 0 and up to π")
+    refuse.unless(
+        0 < view_zenith_max <= math.pi, "view_zenith_max", view_zenith_max, "radians, more than 0 and up to π"
+    )
     refuse.unless(
         0 <= horizon_exclusion < math.pi / 2, "horizon_exclusion", horizon_exclusion, "radians from 0 to less than π/2"
     )
@@ -177,6 +176,7 @@ def observe(
         sun=toward_sun / np.linalg.norm(toward_sun),
         masked=dict(masked),
         block=block,
+        camera=camera,
         **(fields if block == 1 else _bin(fields, block)),
     )
 
@@ -218,7 +218,7 @@ def _bin(fields: dict[str, np.ndarray], block: int) -> dict[str, np.ndarray]:
         return x.reshape(rows, block, columns, block, *x.shape[2:]).swapaxes(1, 2)
 
     split = {key: blocks(value) for key, value in fields.items()}
-    used, shown = split["used"].any((2, 3)), split["shown"].any((2, 3))
+    used, shown = np.any(split["used"], axis=(2, 3)), np.any(split["shown"], axis=(2, 3))
     chosen = np.where(used[..., None, None], split["used"], split["shown"])
     count = np.maximum(chosen.sum((2, 3)), 1)
 
@@ -244,6 +244,12 @@ def _bin(fields: dict[str, np.ndarray], block: int) -> dict[str, np.ndarray]:
     return {key: value.astype(np.float32) for key, value in binned.items()} | {"used": used, "shown": shown}
 
 
+def sigma(of: "Observation | Batch", expected: Float[Array, "*pixels w"] | np.ndarray) -> Float[Array, "*pixels w"]:
+    """Standard deviation of pixels with the signal ``expected``."""
+    positive = jnp.maximum(expected, 0)
+    return jnp.sqrt((of.noise * positive) ** 2 + of.noise_shot * positive + of.noise_floor**2)
+
+
 class Batch(eqx.Module):
     """Several observations in arrays of one shape; ``pixel`` runs over those shown, padded with unused ones."""
 
@@ -264,28 +270,33 @@ class Batch(eqx.Module):
         logs = jnp.concatenate([log_factors, jnp.zeros(1, log_factors.dtype)])
         return (self.exposure_value[:, None] * jnp.exp(logs[self.exposure_index]))[:, None]
 
-    def sigma(self, signal: Float[Array, "image pixel w"]) -> Float[Array, "image pixel w"]:
-        """Standard deviation of pixels with the expected value ``signal``."""
-        positive = jnp.maximum(signal, 0)
-        return jnp.sqrt((self.noise * positive) ** 2 + self.noise_shot * positive + self.noise_floor**2)
+
+def exposure_name(observation: Observation) -> str | None:
+    """Name of the image's free exposure factor, or None if the exposure is fixed."""
+    if observation.exposure == FIXED:
+        return None
+    group = observation.exposure.removesuffix(PER_CHANNEL)
+    return f"exposure_{observation.name if group == FREE else group}"
 
 
-def exposures(observations: Sequence[Observation], wavelengths: Sequence[float]) -> tuple[list[str], np.ndarray]:
+def exposures(
+    observations: Sequence[Observation], wavelengths: Sequence[float]
+) -> tuple[list[str], Int[np.ndarray, "image w"]]:
     """Names of the free exposure factors, and for each image and channel the factor's number, -1 where it is fixed."""
-    factors: dict[tuple[bool, str], int] = {}
+    own = {exposure_name(o) for o in observations if o.exposure.removesuffix(PER_CHANNEL) == FREE}
+    shared = {exposure_name(o) for o in observations if o.exposure.removesuffix(PER_CHANNEL) != FREE}
+    if both := own & shared - {None}:
+        raise FitError(f"{both.pop()}: an image with a free exposure has the name of a group; rename the group")
+    factors: dict[str, int] = {}
     index = np.full((len(observations), len(wavelengths)), -1)
     for image, observation in enumerate(observations):
-        if observation.exposure == FIXED:
+        name = exposure_name(observation)
+        if name is None:
             continue
-        own = observation.exposure.removesuffix(PER_CHANNEL)
-        base = observation.name if own == FREE else own
         for channel, nm in enumerate(wavelengths):
-            name = f"{base}_{nm:g}" if observation.exposure.endswith(PER_CHANNEL) else base
-            index[image, channel] = factors.setdefault((own == FREE, f"exposure_{name}"), len(factors))
-    names = [name for _, name in factors]
-    if len(set(names)) < len(names):
-        raise FitError("exposure: a group has the name of an image with a free exposure; rename the group")
-    return names, index
+            channel_name = f"{name}_{nm:g}" if observation.exposure.endswith(PER_CHANNEL) else name
+            index[image, channel] = factors.setdefault(channel_name, len(factors))
+    return list(factors), index
 
 
 def stack(observations: Sequence[Observation], wavelengths: Sequence[float]) -> Batch:

@@ -1,22 +1,24 @@
-"""Which numbers of an atmosphere are free, and the unbounded coordinates in which they are solved for.
+"""Which numbers of an atmosphere are free, and the coordinates in which they are solved for.
 
-The solver knows no bounds, so it works in coordinates ``y`` that may be any real number, and a bijection maps each to a value
-in its range. One unit of ``y`` is about one natural step of the value (a factor e, or one typical size), so that the
-damping of Levenberg-Marquardt, which is isotropic in ``y``, restrains all parameters alike:
+The solver works in coordinates ``y``, and a bijection maps each to a value in its range. One unit of ``y`` is about
+one natural step of the value (a factor e, or one typical size), so that the damping of Levenberg-Marquardt, which is
+isotropic in ``y``, restrains all parameters alike:
 
-==================================  =======================================================================
+==================================  ====================================================================================
 range                               bijection
-==================================  =======================================================================
+==================================  ====================================================================================
 value > lower                       :class:`Log`
-value >= 0, and 0 is quite likely   :class:`Softplus`: linear at typical sizes, flattening only close to zero
 lower < value < upper               :class:`Logit`
-==================================  =======================================================================
+value >= 0, and 0 may be the truth  :class:`Linear`, on a half-line or an interval of ``y``
+==================================  ====================================================================================
 
-A start value on its bound, where a bijection has no finite coordinate, is moved inside by a small fraction of its range.
+A clear sky has no absorbing aerosol and a dark sea no albedo, so the bounds of these must be reached, not approached:
+in a coordinate that only tends to zero, all derivatives tend to zero with it, and a search that strays there cannot
+come back. :class:`Linear` coordinates have true limits, at which the solver stops, and from which it returns when χ²
+asks.
 """
 
 import difflib
-import math
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, TypeAlias
@@ -35,7 +37,7 @@ Coordinates = Float[Array, " n"]
 
 
 class Bijection(eqx.Module):
-    """A smooth increasing map from the real line onto the range of a value, element by element."""
+    """A smooth increasing map from an interval of coordinates onto the range of a value, element by element."""
 
     @abstractmethod
     def value(self, y: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -43,63 +45,77 @@ class Bijection(eqx.Module):
 
     @abstractmethod
     def coordinate(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
-        """The coordinate of ``value``, which is first moved inside its range if it lies on the bound."""
+        """The coordinate of ``value``; may be infinite at the end of its range."""
 
+    @property
     @abstractmethod
-    def side(self, y: Float[Array, "..."]) -> Int[Array, "..."]:
-        """-1 or +1 where the value is as good as at its lower or upper bound, else 0."""
+    def limits(self) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+        """The smallest and largest coordinate, where the value is as good as at its bound."""
 
 
 class Log(Bijection):
-    """value = lower + unit exp(y)."""
+    """value = lower + unit exp(y), within a factor e^±REACH of ``unit``."""
 
     lower: Float[Array, "..."]
     unit: Float[Array, "..."]
 
+    REACH = 7.0
+
     def value(self, y):
+        """See :class:`Bijection`."""
         return self.lower + self.unit * jnp.exp(y)
 
     def coordinate(self, value):
+        """See :class:`Bijection`."""
         return jnp.log((value - self.lower) / self.unit)
 
-    def side(self, y):
-        return jnp.where(y < math.log(1e-3), -1, 0)
-
-
-class Softplus(Bijection):
-    """value = KNEE unit ln(1 + exp(y / KNEE)): about ``unit`` times y, bent above zero below y = KNEE."""
-
-    unit: Float[Array, "..."]
-
-    KNEE = 0.1
-
-    def value(self, y):
-        return self.KNEE * self.unit * jax.nn.softplus(y / self.KNEE)
-
-    def coordinate(self, value):
-        bent = jnp.maximum(value / (self.KNEE * self.unit), math.log(2))
-        return self.KNEE * (bent + jnp.log(-jnp.expm1(-bent)))
-
-    def side(self, y):
-        return jnp.where(y < -4 * self.KNEE, -1, 0)
+    @property
+    def limits(self):
+        """See :class:`Bijection`."""
+        return jnp.full_like(self.unit, -self.REACH), jnp.full_like(self.unit, self.REACH)
 
 
 class Logit(Bijection):
-    """value = lower + (upper - lower) / (1 + exp(-y)); a start closer to an end than ``margin`` of the width is moved."""
+    """value = lower + (upper - lower) / (1 + exp(-y)), up to e^-REACH of the width from the ends."""
 
     lower: Float[Array, "..."]
     upper: Float[Array, "..."]
-    margin: float
+
+    REACH = 7.0
 
     def value(self, y):
+        """See :class:`Bijection`."""
         return self.lower + (self.upper - self.lower) * jax.nn.sigmoid(y)
 
     def coordinate(self, value):
-        fraction = jnp.clip((value - self.lower) / (self.upper - self.lower), self.margin, 1 - self.margin)
+        """See :class:`Bijection`."""
+        fraction = (value - self.lower) / (self.upper - self.lower)
         return jnp.log(fraction) - jnp.log1p(-fraction)
 
-    def side(self, y):
-        return jnp.where(jnp.abs(y) > 6, jnp.sign(y), 0).astype(int)
+    @property
+    def limits(self):
+        """See :class:`Bijection`."""
+        return jnp.full_like(self.lower, -self.REACH), jnp.full_like(self.lower, self.REACH)
+
+
+class Linear(Bijection):
+    """value = unit y, from 0 to ``upper`` inclusive."""
+
+    unit: Float[Array, "..."]
+    upper: Float[Array, "..."]
+
+    def value(self, y):
+        """See :class:`Bijection`."""
+        return self.unit * y
+
+    def coordinate(self, value):
+        """See :class:`Bijection`."""
+        return value / self.unit
+
+    @property
+    def limits(self):
+        """See :class:`Bijection`."""
+        return jnp.zeros_like(self.unit), self.upper / self.unit
 
 
 class Quantity(NamedTuple):
@@ -148,7 +164,7 @@ class Parameters(eqx.Module):
 
     @property
     def start(self) -> Coordinates:
-        """Coordinates of ``init`` (moved off the bounds)."""
+        """Coordinates of ``init``."""
         return jnp.concatenate([block.start for block in self.blocks])
 
     def _split(self, y: Coordinates) -> list[Coordinates]:
@@ -160,15 +176,19 @@ class Parameters(eqx.Module):
         values = [block.value(part) for block, part in zip(self.blocks, self._split(y), strict=True)]
         return eqx.tree_at(lambda a: [getattr(a, block.field) for block in self.blocks], self.init, values)
 
-    def side(self, y: Coordinates) -> Int[Array, " n"]:
-        """-1 or +1 for each coordinate whose value is as good as at its lower or upper bound, else 0."""
-        return jnp.concatenate([b.bijection.side(part) for b, part in zip(self.blocks, self._split(y), strict=True)])
+    @property
+    def limits(self) -> tuple[Coordinates, Coordinates]:
+        """The smallest and the largest coordinates."""
+        lower, upper = zip(*(block.bijection.limits for block in self.blocks), strict=True)
+        return jnp.concatenate(lower), jnp.concatenate(upper)
 
     def at_bound(self, y: Coordinates) -> Bool[np.ndarray, " q"]:
-        """Whether each number of the free fields is as good as at its bound, in the order of :func:`quantities`."""
-        sides = [b.bijection.side(part) for b, part in zip(self.blocks, self._split(y), strict=True)]
-        sizes = [jnp.size(getattr(self.init, block.field)) for block in self.blocks]
-        return np.concatenate([np.broadcast_to(side != 0, size) for side, size in zip(sides, sizes, strict=True)])
+        """Whether each number of the free fields is at its bound, in the order of :func:`quantities`."""
+        result = []
+        for block, part in zip(self.blocks, self._split(y), strict=True):
+            lower, upper = block.bijection.limits
+            result.append(np.broadcast_to((part <= lower) | (part >= upper), jnp.size(getattr(self.init, block.field))))
+        return np.concatenate(result)
 
     def colours(self) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"]]:
         """The colouring of the Jacobian: for each coordinate the tangent it shares, and the one channel it touches.
@@ -193,44 +213,38 @@ _Choice: TypeAlias = Callable[[Atmosphere, Array], Bijection]
 
 
 def _positive(typical: float) -> _Choice:
-    """Log from the start value; a field that starts at zero gets a softplus of ``typical`` size to leave it by."""
+    """Log around the start value; a field with a zero in it is linear instead, to be able to leave it."""
+    linear = _maybe_zero(typical)
 
     def choose(init: Atmosphere, value: Array) -> Bijection:
-        del init
-        if bool(jnp.all(value > 0)):
-            return Log(jnp.zeros_like(value), value)
-        return Softplus(jnp.full_like(value, max(typical, float(jnp.max(value)))))
+        return Log(jnp.zeros_like(value), value) if bool(jnp.all(value > 0)) else linear(init, value)
 
     return choose
 
 
-def _maybe_zero(typical: float) -> _Choice:
-    """Softplus, of the size of the start value where that is not zero."""
+def _maybe_zero(typical: float, upper: float = jnp.inf) -> _Choice:
+    """Linear, in units of the largest start value, or of the ``typical`` one if the start is zero."""
 
     def choose(init: Atmosphere, value: Array) -> Bijection:
         del init
         largest = float(jnp.max(value))
-        return Softplus(jnp.full_like(value, largest if largest > 0 else typical))
+        return Linear(jnp.full_like(value, largest if largest > 0 else typical), jnp.full_like(value, upper))
 
     return choose
 
 
-def _between(lower: float, upper: float, margin: float) -> _Choice:
-    return lambda init, value: Logit(jnp.full_like(value, lower), jnp.full_like(value, upper), margin)
-
-
 _CHOICES: dict[str, _Choice] = {
     "solar_irradiance": _positive(1.0),
-    "bottom_radius": lambda init, value: Logit(jnp.zeros_like(value), init.top_radius[None], 1e-6),
+    "bottom_radius": lambda init, value: Logit(jnp.zeros_like(value), init.top_radius[None]),
     "top_radius": lambda init, value: Log(init.bottom_radius[None], init.top_altitude[None]),
     "rayleigh_scattering": _positive(1e-2),
     "rayleigh_scale_height": _positive(8.0),
     "mie_scattering": _positive(4e-3),
     "mie_absorption": _maybe_zero(4e-4),
     "mie_scale_height": _positive(1.2),
-    "mie_g": _between(-1.0, 1.0, 0.002),
+    "mie_g": lambda init, value: Logit(-jnp.ones_like(value), jnp.ones_like(value)),
     "ozone_absorption": _maybe_zero(1e-3),
-    "ground_albedo": _between(0.0, 1.0, 0.05),
+    "ground_albedo": _maybe_zero(0.3, upper=1.0),
     "ozone_center_altitude": _positive(25.0),
     "ozone_half_width": _positive(15.0),
 }
@@ -241,18 +255,18 @@ FREE_FIELDS = tuple(_CHOICES)
 
 
 def _unit(field: str) -> str:
-    return {"_km": "km", "_per_km": "1/km", "_nm": "nm"}.get(FILE_KEYS[field].removeprefix(field), "")
+    suffix = FILE_KEYS.get(field, field).removeprefix(field)
+    return {"_km": "km", "_per_km": "1/km", "_nm": "nm", "": ""}[suffix]
 
 
-def quantities(fields: Sequence[str], wavelengths: Sequence[float], unit: str | None = None) -> list[Quantity]:
+def quantities(fields: Sequence[str], wavelengths: Sequence[float]) -> list[Quantity]:
     """What each number of ``fields`` is, in order; spectral fields have one number per wavelength."""
     result = []
     for field in fields:
-        u = _unit(field) if unit is None else unit
         if field in SPECTRAL or field in DERIVED:
-            result += [Quantity(spectral_name(field, nm), field, nm, u) for nm in wavelengths]
+            result += [Quantity(spectral_name(field, nm), field, nm, _unit(field)) for nm in wavelengths]
         else:
-            result.append(Quantity(field, field, None, u))
+            result.append(Quantity(field, field, None, _unit(field)))
     return result
 
 
@@ -270,7 +284,7 @@ DERIVED: dict[str, tuple[Callable[[Atmosphere], Float[Array, " w"]], tuple[str, 
         ("mie_scattering", "mie_absorption"),
     ),
 }
-"""Combinations that images determine better than their factors: name -> (function of the atmosphere, its ingredients)."""
+"""Combinations that images determine better than their factors: name -> (function, the fields it depends on)."""
 
 
 def derived_fields(free: Sequence[str]) -> list[str]:
@@ -293,8 +307,8 @@ def _unknown(name: Any, allowed: Sequence[str]) -> str:
 def select(init: Atmosphere, free: Sequence[str], scaled: Sequence[str] = ()) -> Parameters:
     """Make the fields ``free`` of ``init`` free.
 
-    A spectral field is free at every wavelength, or, if it is in ``scaled`` as well, by one factor that keeps the ratios of
-    ``init``. Raises :class:`FitError` for a name that cannot be free.
+    A spectral field is free at every wavelength, or, if it is in ``scaled`` as well, by one factor that keeps the
+    ratios of ``init``. Raises :class:`FitError` for a name that cannot be free.
     """
     if isinstance(free, str) or isinstance(scaled, str):
         raise FitError("free: got one string, expected a list of names")
@@ -320,12 +334,11 @@ def _block(init: Atmosphere, field: str, scaled: bool) -> Block:
     value = jnp.atleast_1d(getattr(init, field))
     if not scaled:
         bijection = _CHOICES[field](init, value)
-        return Block(field, bijection, bijection.coordinate(value), None)
+        lower, upper = bijection.limits
+        return Block(field, bijection, jnp.clip(bijection.coordinate(value), lower, upper), None)
     largest = jnp.max(value)
     if largest == 0:
         raise FitError(f"scaled: {field!r} starts at zero at every wavelength, so no factor can change it")
     one = jnp.ones_like(value, shape=(1,))
-    factor: Bijection = Log(jnp.zeros_like(one), one)
-    if field == "ground_albedo":
-        factor = Logit(jnp.zeros_like(one), one / largest, 0.05)
-    return Block(field, factor, factor.coordinate(one), value)
+    upper = one / largest if field == "ground_albedo" else jnp.inf * one
+    return Block(field, Linear(one, upper), one, value)

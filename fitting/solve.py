@@ -1,20 +1,25 @@
 """The solution of a fit by Levenberg-Marquardt, without its error bars.
 
 Each step costs one evaluation of the model with its derivatives over all pixels, compiled once; it is reduced to the
-triangular factor of [J r] (:func:`fitting.residuals.triangle`), in which optimistix then takes its step. As the loop over
-steps runs in Python, progress can be shown, the time of a step is known, and an interrupt ends the fit at its best point.
+triangular factor of [J r] (:func:`fitting.residuals.triangle`), in which optimistix then takes its step. As the loop
+over steps runs in Python, progress can be shown, the time of a step is known, and an interrupt ends the fit at its
+best point.
 
-*Convergence* is judged in units of the parameters' own uncertainty, as in MINUIT: the squared distance to the minimum,
-(Jᵀr)ᵀ (JᵀJ)⁻¹ Jᵀr, says by how much χ² would still fall if the residuals were linear. Below 0.01 every parameter is within a
-tenth of its standard error of the optimum. Parameters held by their bounds do not count.
+*Convergence* is judged in units of the parameters' own uncertainty, as in MINUIT: the squared distance to the
+optimum, (Jᵀr)ᵀ (JᵀJ)⁻¹ Jᵀr, says by how much χ² would still fall if the residuals were linear. At a distance of 0.1
+every parameter is within a tenth of its standard error of the optimum. Directions that the data leave open to more than
+a natural unit of the coordinates, and parameters held by their bounds, do not count.
 
-*Noise.* sigma depends on the expected signal, which is known only after the fit. Taken from the noisy pixels it favours those
-that came out dark, and biases the radiance by about -2 (relative noise)²: 2e-4 for 1 % noise, ten standard errors of a
-well-determined parameter. So the fit has two passes: sigma from the measured signal first, then from the fitted one.
+*Noise.* sigma depends on the expected signal, which is known only after the fit. Taken from the noisy pixels it
+favours those that came out dark, and biases the radiance by about -2 (relative noise)²: 2e-4 for 1 % noise, ten
+standard errors of a well-determined parameter. So the fit has two passes: sigma from the measured signal first, then
+from the fitted one.
 """
 
+import math
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -27,18 +32,20 @@ from jaxtyping import Array, Float
 from diffatmo.atmosphere import Atmosphere
 from diffatmo.models.base import Model
 from fitting._errors import FitError
-from fitting.observation import Batch, Observation, exposures, stack
+from fitting.observation import Batch, Observation, exposures, sigma, stack
 from fitting.parameters import Coordinates, Parameters, select
-from fitting.residuals import Predicted, Problem, linearise, triangle
+from fitting.residuals import Linearisation, Predicted, Problem, jacobian, linearise, triangle
 
-TOLERANCE = 0.01
+TOLERANCE = 0.1
+"""Distance to the optimum, in standard errors, at which the fit has converged."""
+
 MAX_STEPS = 100
 
 FIRST_PASS_TOLERANCE = 1.0
-"""The first pass only has to find the sigma of the second: one standard error from its optimum is plenty."""
+"""The first pass only has to find the sigma of the second: one standard error from its optimum is near enough."""
 
-ROUNDING_DISTANCE = 0.1
-"""Squared distance below which rejected steps mean that rounding hides the last of the way."""
+ROUNDING_DISTANCE = 0.3
+"""Distance below which rejected steps mean that rounding hides the last of the way."""
 
 REJECTIONS_AT_ROUNDING, REJECTIONS_AT_MOST = 3, 20
 
@@ -46,7 +53,7 @@ INTERRUPTED = "interrupted by the user"
 OUT_OF_STEPS = "stopped: not converged in the steps allowed"
 
 # The test for convergence is made here, so optimistix's own is set out of reach.
-_SOLVER = optx.LevenbergMarquardt(rtol=1e-30, atol=1e-30)
+_SOLVER: optx.LevenbergMarquardt = optx.LevenbergMarquardt(rtol=1e-30, atol=1e-30)
 
 
 class Step(NamedTuple):
@@ -54,7 +61,8 @@ class Step(NamedTuple):
 
     ``chi2`` is that of the point tried (infinite where the model was), ``accepted`` whether it became the current one;
     ``change`` is the largest change of a coordinate that led to it (about the relative change of a parameter),
-    ``distance`` the squared distance to the minimum from the current point, in standard errors.
+    ``distance`` that from the current point to the optimum, in standard errors, ``damping`` the λ of
+    the next step, and ``stage`` 1 while sigma comes from the measured signal, 2 when it comes from the fitted one.
     """
 
     step: int
@@ -97,10 +105,12 @@ class Solution(NamedTuple):
         return self.residual_count - self.y.size
 
 
+_linearise = eqx.filter_jit(linearise)
+
+
 @eqx.filter_jit
-def _evaluate(y: Coordinates, problem: Problem) -> tuple[Predicted, Float[Array, "n+1 n+1"]]:
-    expected, residual, jacobian = linearise(y, problem)
-    return expected, triangle(residual, jacobian)
+def _reduce(y: Coordinates, linearisation: Linearisation, problem: Problem) -> Float[Array, "n+1 n+1"]:
+    return triangle(*jacobian(y, linearisation, problem))
 
 
 def _tangent_plane(y: Coordinates, plane: tuple[Array, Array, Array]) -> tuple[Array, None]:
@@ -123,93 +133,116 @@ def _step(y: Coordinates, state: Any, plane: tuple[Array, Array, Array]) -> tupl
     return y, state
 
 
-def squared_distance(factor: Float[np.ndarray, "n+1 n+1"], side: np.ndarray) -> float:
-    """Squared distance to the minimum in standard errors, over the parameters that are not held by a bound.
+def distance(factor: Float[np.ndarray, "n+1 n+1"], misfit: float = 1.0) -> float:
+    """Distance to the optimum, in standard errors, in the directions that the data determine.
 
-    ``side`` is -1 or +1 for a parameter at its lower or upper bound; it is held there if χ² falls further outward.
+    Its square is the amount by which χ² / ``misfit`` would still fall if the residuals were linear. A direction with the standard error s, in
+    natural units of the coordinates, counts by 1 / (1 + s²). The variance of the noise is ``misfit`` times the stated one.
     """
-    r, z = factor[:-1, :-1], factor[:-1, -1]
-    r = r[:, ~(side * (r.T @ z) < 0)]
-    length = np.linalg.norm(r, axis=0)
-    left, singular, _ = np.linalg.svd(r / np.where(length > 0, length, 1), full_matrices=False)
-    known = singular > 10 * np.finfo(np.float32).eps
-    return float(np.sum((left[:, known].T @ z) ** 2))
+    left, singular, _ = np.linalg.svd(factor[:, :-1] / math.sqrt(misfit), full_matrices=False)
+    along = left.T @ factor[:, -1] / math.sqrt(misfit)
+    return math.sqrt(np.sum(along**2 * singular**2 / (1 + singular**2)))
 
 
-class _Pass(NamedTuple):
+def _hold(
+    factor: Float[np.ndarray, "n+1 n+1"], y: np.ndarray, limits: tuple[np.ndarray, np.ndarray]
+) -> Float[np.ndarray, "n+1 n+1"]:
+    """``factor`` without the derivatives for coordinates that χ² pushes against their limits: no step moves them."""
+    gradient = factor[:, :-1].T @ factor[:, -1]
+    held = ((y <= limits[0]) & (gradient > 0)) | ((y >= limits[1]) & (gradient < 0))
+    return np.where(np.append(held, False), 0, factor)
+
+
+class _Point(NamedTuple):
+    """A point of the search, and why the search ended if it ended there."""
+
     y: Coordinates
-    triangle: np.ndarray
-    predicted: np.ndarray
-    converged: bool
-    message: str
+    linearisation: Linearisation
+    triangle: Float[np.ndarray, "n+1 n+1"]
+    chi2: float
+    distance: float
+    converged: bool = False
+    message: str = OUT_OF_STEPS
 
 
 def _minimise(
     y: Coordinates,
+    start: Linearisation,
     problem: Problem,
     *,
+    evaluate: Callable[[Coordinates, Problem], Linearisation],
     tolerance: float,
     max_steps: int,
     history: list[Step],
     progress: Progress | None,
-) -> _Pass:
-    """Levenberg-Marquardt from ``y`` in at most ``max_steps`` steps, which are appended to ``history``."""
+) -> _Point:
+    """Levenberg-Marquardt from ``y``, where the model is linearised already, until ``history`` holds ``max_steps``."""
     state = _start(y)
-    best: _Pass | None = None
-    rejections = 0
+    limits = (np.asarray(problem.limits[0]), np.asarray(problem.limits[1]))
+    freedom = max(_count(problem.batch) - y.size, 1)
     stage = history[-1].stage + 1 if history else 1
-    degrees_of_freedom = max(_count(problem.batch) - y.size, 1)
-    message, converged = OUT_OF_STEPS, False
+    best: _Point | None = None
+    misfit, rejections = 1.0, 0
     try:
-        for _ in range(max_steps):
+        while best is None or len(history) < max_steps:
             started = time.perf_counter()
-            trial = state.y_eval
-            predicted, factor = _evaluate(trial, problem)
-            host = np.asarray(factor, dtype=np.float64)
-            finite = bool(np.all(np.isfinite(host)))
-            if best is None and not finite:
-                raise FitError(_not_finite(np.asarray(predicted), problem.batch))
-            if not finite:
+            trial = jnp.clip(state.y_eval, *limits)
+            linearisation = start if best is None else evaluate(trial, problem)
+            factor = np.asarray(_reduce(trial, linearisation, problem), dtype=np.float64)
+            finite = bool(np.all(np.isfinite(factor)))
+            if finite:
+                chi2, held = float(np.sum(factor[:, -1] ** 2)), _hold(factor, np.asarray(trial), limits)
+            else:
                 # An infinitely bad point, in numbers whose squares do not overflow: the step is rejected and shortened.
-                factor = jnp.zeros_like(factor).at[-1, -1].set(1e15)
+                chi2, held = math.inf, np.diag([0.0] * y.size + [1e15])
+            step_size = state.search_state.step_size
+            if best is None or chi2 < best.chi2:
+                # The damping follows the misfit: with λ = 1 a step is restrained to about a natural unit in directions
+                # that the data, given residuals of the present size, determine no better than that.
+                previous, misfit = misfit, max(1.0, chi2 / freedom)
+                step_size = step_size * (previous / misfit)
+            state = eqx.tree_at(lambda s: (s.y_eval, s.search_state.step_size), state, (trial, step_size))
             change = float(jnp.max(jnp.abs(trial - y)))
-            y, state = _step(y, state, (factor[:, -1], factor[:, :-1], trial))
-            accepted = finite and bool(jnp.all(y == trial))
-            rejections = 0 if accepted else rejections + 1
+            plane = jnp.asarray(held, dtype=y.dtype)
+            y, state = _step(y, state, (plane[:, -1], plane[:, :-1], trial))
+            accepted = best is None or (finite and bool(jnp.all(y == trial)))
             if best is None or accepted:
-                best = _Pass(y, host, np.asarray(predicted), False, "")
-            distance = squared_distance(best.triangle, np.asarray(problem.side(y)))
-            chi2 = float(np.sum(host[:, -1] ** 2)) if finite else float("inf")
+                best = _Point(y, linearisation, factor, chi2, distance(held, misfit))
+            rejections = 0 if accepted else rejections + 1
             history.append(
                 Step(
                     step=len(history),
                     stage=stage,
                     chi2=chi2,
-                    reduced_chi2=chi2 / degrees_of_freedom,
+                    reduced_chi2=chi2 / freedom,
                     accepted=accepted,
                     change=change,
-                    distance=distance,
+                    distance=best.distance,
                     damping=1 / max(float(state.search_state.step_size), 1e-30),
                     seconds=time.perf_counter() - started,
                 )
             )
             if progress is not None:
                 progress(history[-1])
-            if distance < tolerance:
-                converged, message = True, f"converged: χ² would fall by {distance:.2g} more"
-                break
-            if rejections >= REJECTIONS_AT_ROUNDING and distance < ROUNDING_DISTANCE:
-                converged, message = True, f"converged to rounding: χ² would fall by {distance:.2g} more"
-                break
-            if rejections >= REJECTIONS_AT_MOST:
-                message = f"stopped: no step improves the fit, though χ² should fall by {distance:.2g} more"
-                break
+            end = _end(best.distance, rejections, tolerance)
+            if end is not None:
+                return best._replace(converged=end[0], message=end[1])
     except KeyboardInterrupt:
         if best is None:
             raise
-        message = INTERRUPTED
-    assert best is not None
-    return best._replace(converged=converged, message=message)
+        return best._replace(message=INTERRUPTED)
+    return best
+
+
+def _end(away: float, rejections: int, tolerance: float) -> tuple[bool, str] | None:
+    """Whether the search has converged and how it ended; None while it has to go on."""
+    if away < tolerance:
+        return True, f"converged: {away:.2g} standard errors from the optimum"
+    if rejections >= REJECTIONS_AT_ROUNDING and away < ROUNDING_DISTANCE:
+        return True, f"converged as far as rounding allows: {away:.2g} standard errors from the optimum"
+    if rejections >= REJECTIONS_AT_MOST:
+        return False, f"stopped: no step improves the fit, {away:.2g} standard errors from where the optimum should be"
+    return None
 
 
 def _count(batch: Batch) -> int:
@@ -217,23 +250,30 @@ def _count(batch: Batch) -> int:
     return int(jnp.sum(batch.used)) * batch.measured.shape[-1]
 
 
-def _not_finite(predicted: np.ndarray, batch: Batch) -> str:
-    bad = ~np.isfinite(predicted) & np.asarray(batch.used)[..., None]
-    images = np.flatnonzero(bad.any((1, 2)))
-    if images.size:
-        return f"the model is not finite at the start values, in {bad.sum()} pixels and channels of image {images[0] + 1}"
-    return "the model is finite at the start values, but its derivatives are not"
+def _check_finite(start: Linearisation, batch: Batch, names: Sequence[str]) -> None:
+    """Refuse start values at which the model or its derivatives are not finite where they are needed."""
+    used = np.asarray(batch.used)
+    for values, what in ((start.radiance, "radiance"), (start.tangents, "derivatives")):
+        bad = used & ~np.isfinite(np.asarray(values)).all(axis=tuple(range(2, values.ndim)))
+        for name, count in zip(names, bad.sum(axis=1), strict=True):
+            if count:
+                raise FitError(f"{name}: the model's {what} at the start values are not finite in {count} pixels")
 
 
 def _weigh(problem: Problem, expected: Array) -> Problem:
     """``problem`` with the weights of pixels whose expected signal is ``expected``."""
-    weight = jnp.where(problem.batch.used[..., None], 1 / problem.batch.sigma(expected), 0)
+    weight = jnp.where(problem.batch.used[..., None], 1 / sigma(problem.batch, expected), 0)
     return eqx.tree_at(lambda p: p.weight, problem, weight)
 
 
-def _starting_exposures(predicted: np.ndarray, batch: Batch) -> Float[np.ndarray, " e"]:
-    """Logarithms of the factors that bring the median of measured / predicted to one."""
-    ratio = np.asarray(batch.measured) / np.where(predicted > 0, predicted, np.inf)
+def _expected(point: _Point, problem: Problem) -> Predicted:
+    return point.linearisation.radiance * problem.batch.exposure(problem.split(point.y)[1])
+
+
+def _starting_exposures(radiance: np.ndarray, batch: Batch) -> Float[np.ndarray, " e"]:
+    """Logarithms of the factors that bring the median of measured / expected to one."""
+    expected = radiance * np.asarray(batch.exposure_value)[:, None, None]
+    ratio = np.asarray(batch.measured) / np.where(expected > 0, expected, np.inf)
     usable = np.asarray(batch.used)[..., None] & (ratio > 0) & np.isfinite(ratio)
     index = np.broadcast_to(np.asarray(batch.exposure_index)[:, None], ratio.shape)
     chosen = [ratio[usable & (index == number)] for number in range(batch.exposure_count)]
@@ -267,45 +307,45 @@ def solve(
     names, _ = exposures(observations, wavelengths)
     size = parameters.size + batch.exposure_count
     if _count(batch) < size:
-        raise FitError(f"{_count(batch)} pixels and channels cannot determine {size} parameters; mask less or free less")
+        raise FitError(
+            f"{_count(batch)} pixels and channels cannot determine {size} parameters; mask less or free less"
+        )
     problem = _weigh(Problem(model, parameters, batch, jnp.zeros_like(batch.measured)), batch.measured)
-    y = jnp.concatenate([parameters.start, jnp.zeros(batch.exposure_count, parameters.start.dtype)])
-    if names:
-        predicted, _ = _evaluate(y, problem)
-        y = y.at[parameters.size :].set(_starting_exposures(np.asarray(predicted), batch))
+    seconds: list[float] = []
+
+    def evaluate(y: Coordinates, problem: Problem) -> Linearisation:
+        before = time.perf_counter()
+        result = jax.block_until_ready(_linearise(y[: parameters.size], problem))
+        seconds.append(time.perf_counter() - before)
+        return result
+
+    start = evaluate(parameters.start, problem)
+    _check_finite(start, batch, [observation.name for observation in observations])
+    log_factors = jnp.asarray(_starting_exposures(np.asarray(start.radiance), batch), parameters.start.dtype)
     history: list[Step] = []
-    best = _minimise(
-        y,
+    search = partial(_minimise, evaluate=evaluate, max_steps=max_steps, history=history, progress=progress)
+    best = search(
+        jnp.concatenate([parameters.start, log_factors]),
+        start,
         problem,
         tolerance=max(tolerance, FIRST_PASS_TOLERANCE),
-        max_steps=max_steps,
-        history=history,
-        progress=progress,
     )
-    if best.message != INTERRUPTED and len(history) < max_steps:
-        best = _minimise(
-            best.y,
-            _weigh(problem, jnp.asarray(best.predicted)),
-            tolerance=tolerance,
-            max_steps=max_steps - len(history),
-            history=history,
-            progress=progress,
-        )
-    elif best.converged:
-        best = best._replace(converged=False, message=OUT_OF_STEPS)
+    if best.message != INTERRUPTED:
+        expected = _expected(best, problem)
+        best = search(best.y, best.linearisation, _weigh(problem, expected), tolerance=tolerance)
     total = time.perf_counter() - started
-    # What a typical step does not explain is compilation and preparation, which happen once.
-    steps = min(total, len(history) * float(np.median([step.seconds for step in history])))
+    # What a typical evaluation does not explain is compilation and preparation, which happen once.
+    evaluations = min(total, len(seconds) * float(np.median(seconds)))
     return Solution(
         parameters=parameters,
         batch=batch,
         exposure_names=names,
         y=best.y,
         triangle=best.triangle,
-        predicted=best.predicted,
+        predicted=np.asarray(_expected(best, problem)),
         history=history,
         residual_count=_count(batch),
         converged=best.converged,
         message=best.message,
-        timings={"compile_s": total - steps, "solve_s": steps, "total_s": total},
+        timings={"compile_s": total - evaluations, "solve_s": evaluations, "total_s": total},
     )

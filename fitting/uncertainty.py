@@ -1,15 +1,16 @@
 """Error bars: what the images determine, how well, and what they do not.
 
-Around the optimum the whitened residuals are linear in the coordinates y, so the covariance of y is (JᵀJ)⁻¹ = (RᵀR)⁻¹, with
-R from the last step of the solution; that of the physical numbers q(y) is G (JᵀJ)⁻¹ Gᵀ with G = dq/dy (the delta method).
-This linear algebra is a few numbers only and is done in float64 on the host, on columns scaled to length one.
+Around the optimum the whitened residuals are linear in the coordinates y, so the covariance of y is (JᵀJ)⁻¹ =
+(RᵀR)⁻¹, with R from the last step of the solution; that of the physical numbers q(y) is G (JᵀJ)⁻¹ Gᵀ with G = dq/dy
+(the delta method). This linear algebra is a few numbers only and is done in float64 on the host, on columns scaled to
+length one.
 
-A combination of coordinates that changes no residual beyond rounding is not determined: it is left out of the inverse, and
-every number that would move along it gets no standard error at all.
+A combination of coordinates that changes no residual beyond rounding is not determined: it is left out of the
+inverse, and every number that would move along it gets no standard error at all.
 
-Standard errors are multiplied by √(reduced χ²) where that exceeds one, as the Particle Data Group does: if the residuals are
-larger than the stated noise, either the noise is understated or the model does not describe the image, and neither leaves
-room for more confidence.
+Standard errors are multiplied by √(reduced χ²) where that exceeds one, as the Particle Data Group does: if the
+residuals are larger than the stated noise, either the noise is understated or the model does not describe the image,
+and neither leaves room for more confidence.
 """
 
 import math
@@ -19,16 +20,16 @@ from dataclasses import dataclass, field, replace
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from diffatmo.atmosphere import Atmosphere
-from diffatmo.models.base import Model
+from diffatmo.models import Model, Moments
 from fitting._errors import FitError
-from fitting.observation import Observation, unstack
+from fitting.observation import Observation, sigma, unstack
 from fitting.parameters import Coordinates, derived_fields, numbers, quantities
 from fitting.solve import MAX_STEPS, TOLERANCE, Progress, Solution, Step, solve
 
-RANK_TOLERANCE = 10 * float(np.finfo(np.float32).eps)
+RANK_TOLERANCE = 3e-5
 """Singular values of the scaled R below this are rounding: J is computed in float32."""
 
 
@@ -36,8 +37,9 @@ RANK_TOLERANCE = 10 * float(np.finfo(np.float32).eps)
 class Estimate:
     """A number with its error bar; ``standard_error`` is None where the images do not determine it.
 
-    ``field`` and ``wavelength`` (nm) say what ``name`` stands for; ``derived`` marks combinations of fitted numbers, and
-    ``at_bound`` values held by the edge of their range, whose error bar only tells how sharp the edge is approached.
+    ``field`` and ``wavelength`` (nm) say what ``name`` stands for; ``derived`` marks combinations of fitted numbers,
+    and ``at_bound`` values held by the edge of their range, whose error bar only tells how sharp the edge is
+    approached.
     """
 
     name: str
@@ -63,8 +65,8 @@ class Estimate:
 class FitResult:
     """What a fit found. Arrays are NumPy's; ``covariance`` belongs to the numbers named in ``covariance_names``.
 
-    Covariances of numbers that the images do not determine are NaN. ``fitted`` are the expected images in the units of the
-    measured ones (NaN outside the fitted region), ``observations`` the images as they were fitted.
+    Covariances of numbers that the images do not determine are NaN. ``fitted`` are the expected images in the units
+    of the measured ones (NaN outside the fitted region), ``observations`` the images as they were fitted.
     """
 
     atmosphere: Atmosphere
@@ -102,6 +104,14 @@ class FitResult:
             known = observation.used[..., None] & (image > 0)
             result.append(np.where(known, observation.image / np.where(known, image, 1) - 1, np.nan).astype(np.float32))
         return result
+
+    @property
+    def whitened(self) -> list[Float[np.ndarray, "height width w"]]:
+        """(measured - fitted) / sigma of each image, NaN where a pixel was not used."""
+        return [
+            np.where(o.used[..., None], (o.image - image) / np.asarray(sigma(o, image)), np.nan).astype(np.float32)
+            for o, image in zip(self.observations, self.fitted, strict=True)
+        ]
 
     def estimate(self, name: str) -> Estimate:
         """The parameter, derived quantity or exposure called ``name``."""
@@ -162,7 +172,7 @@ def summarise(solution: Solution, observations: Sequence[Observation]) -> FitRes
     fitted_quantities = quantities(free, wavelengths)
     all_quantities = fitted_quantities + quantities(derived, wavelengths)
 
-    def physical(y: Coordinates) -> Float[np.ndarray, " q"]:
+    def physical(y: Coordinates) -> Float[Array, " q"]:
         return jnp.concatenate([numbers(parameters.atmosphere(y[:count]), free + derived), jnp.exp(y[count:])])
 
     values = np.asarray(physical(solution.y), dtype=float)
@@ -230,31 +240,29 @@ def fit(
     Args:
         observations: From :func:`fitting.observe`; all are explained by the one atmosphere.
         init: Where the search starts, and the value of everything that is not free.
-        free: Names of the fields of :class:`~diffatmo.atmosphere.Atmosphere` to recover; a spectral field is free at every
+        free: Names of the fields of :class:`~diffatmo.atmosphere.Atmosphere` to recover; a spectral field is free at
+        every
             wavelength.
         scaled: Those of the spectral ones of which only a common factor is free.
         model: How the sky is computed, :class:`~diffatmo.models.moments.Moments` by default.
         progress: Called after each step.
         max_steps: Evaluations of the model with its derivatives before the fit gives up.
-        tolerance: Squared distance to the optimum, in standard errors, at which it is found.
+        tolerance: Distance to the optimum, in standard errors, at which it is found.
 
     Returns:
         The best point found; ``converged`` and ``message`` say whether it is the optimum and why the fit stopped.
 
     Raises:
-        FitError: The fit cannot be started: a name that is not a parameter, images that do not go together, a model that is
+        FitError: The fit cannot be started: a name that is not a parameter, images that do not go together, a model
+        that is
             not finite at the start.
     """
-    if model is None:
-        from diffatmo.models import Moments
-        model = Moments()
-
     solution = solve(
         observations,
         init=init,
         free=free,
         scaled=scaled,
-        model=model,
+        model=Moments() if model is None else model,
         progress=progress,
         max_steps=max_steps,
         tolerance=tolerance,

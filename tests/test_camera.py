@@ -58,7 +58,7 @@ def test_pixels_and_directions_are_inverse(any_camera):
     seen = found["seen"]
     assert np.isfinite(found["xy"]).all()
     np.testing.assert_allclose(found["again"][seen], towards[seen], atol=3e-6)
-    # The share of random directions that is seen is the solid angle of the picture; 4000 of them know it to 0.008 (1 σ).
+    # The share of random directions that is seen is the picture's solid angle; 4000 of them know it to 0.008 (1 σ).
     share = found["solid angles"][valid].sum() / (4 * np.pi)
     assert seen.mean() == pytest.approx(share, abs=0.025)
 

@@ -10,7 +10,6 @@ from collections.abc import Sequence
 import click
 
 from diffatmo import __version__
-from diffatmo.cli.common import InputError
 from diffatmo.cli.fit import fit
 from diffatmo.cli.radiance import radiance
 from diffatmo.cli.render import render
@@ -19,7 +18,9 @@ BAD_INPUT = 2
 INTERRUPTED = 130
 
 
-@click.group(invoke_without_command=True, context_settings={"help_option_names": ["-h", "--help"]})
+@click.group(
+    invoke_without_command=True, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110}
+)
 @click.version_option(__version__, message="%(prog)s %(version)s")
 @click.pass_context
 def diffatmo(context: click.Context) -> None:
@@ -42,21 +43,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         status = diffatmo.main(args=arguments, prog_name="diffatmo", standalone_mode=False)
     except click.Abort:
         return INTERRUPTED
-    except (click.ClickException, InputError, OSError) as error:
+    except (click.ClickException, OSError) as error:
         return _refuse(error)
     except ValueError as error:
-        if not _is_bad_input(error):
+        # The errors of our own refuse what the user gave; any other is a fault of ours and keeps its traceback.
+        if type(error).__module__.partition(".")[0] not in ("diffatmo", "fitting"):
             raise
         return _refuse(error)
     return status or 0
-
-
-def _is_bad_input(error: ValueError) -> bool:
-    """Whether the library refused a value it was given; any other ValueError is a fault of ours and keeps its traceback."""
-    from diffatmo.atmosphere import AtmosphereError
-    from diffatmo.imageio import ImageError
-
-    return isinstance(error, AtmosphereError | ImageError)
 
 
 def _refuse(error: Exception) -> int:

@@ -1,7 +1,6 @@
 """``diffatmo radiance``: radiance and transmittance of an atmosphere along a table of directions."""
 
 import csv
-import math
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from diffatmo.cli.common import InputError, check_output, make_model, model_option, overwrite_option, read_atmosphere
+from diffatmo.cli.keys import Number
 
 if TYPE_CHECKING:
     import numpy as np
@@ -18,12 +18,12 @@ if TYPE_CHECKING:
     from diffatmo.models import Model
 
 COLUMNS = {
-    "altitude_km": (0.0, math.inf),
-    "sun_zenith_deg": (0.0, 180.0),
-    "view_zenith_deg": (0.0, 180.0),
-    "view_azimuth_deg": (-math.inf, math.inf),
+    "altitude_km": Number("Height above the ground.", 0),
+    "sun_zenith_deg": Number("Zenith angle of the sun.", 0, 180),
+    "view_zenith_deg": Number("Zenith angle of the view: 0 is up, 180 down.", 0, 180),
+    "view_azimuth_deg": Number("Azimuth of the view relative to the sun's."),
 }
-"""The columns that are read, with the range of each."""
+"""The columns that are read."""
 
 CHUNK = 4096
 """Rows computed at a time: bounds the memory, whatever the length of the table."""
@@ -41,7 +41,9 @@ class Table:
 @click.command()
 @click.argument("atmosphere", metavar="ATM.toml")
 @click.argument("directions", metavar="DIRECTIONS.csv", type=click.Path(path_type=Path))
-@click.option("-o", "--output", metavar="OUT.csv", type=click.Path(path_type=Path), required=True, help="File to write.")
+@click.option(
+    "-o", "--output", metavar="OUT.csv", type=click.Path(path_type=Path), required=True, help="File to write."
+)
 @model_option
 @click.option("--x64", is_flag=True, help="Compute in double precision.")
 @overwrite_option
@@ -50,8 +52,8 @@ def radiance(atmosphere: str, directions: Path, output: Path, model: str, x64: b
 
     ATM.toml is an atmosphere file or the name of a preset. DIRECTIONS.csv has the columns altitude_km, sun_zenith_deg,
     view_zenith_deg and view_azimuth_deg, the azimuth relative to the sun's. OUT.csv repeats its rows in the same order,
-    followed by radiance_<nm> and transmittance_<nm> for every wavelength, and stderr_<nm> for the path tracer. Sunlit and
-    skylit ground is included where the ray meets it, the sun's disc is not.
+    followed by radiance_<nm> and transmittance_<nm> for every wavelength, and stderr_<nm> for the path tracer. Sunlit
+    and skylit ground is included where the ray meets it, the sun's disc is not.
     """
     check_output(output, overwrite=overwrite)
     table = read_table(directions)
@@ -61,11 +63,12 @@ def radiance(atmosphere: str, directions: Path, output: Path, model: str, x64: b
         if x64:
             stack.enter_context(jax.enable_x64(True))
         air = read_atmosphere(atmosphere)
-        taken = sorted(set(table.header) & set(new_columns(air)))
+        columns = new_columns(air)
+        taken = [name for name in columns if name in table.header]
         if taken:
             raise InputError(f"{directions}: has a column {taken[0]} already")
-        columns = compute(air, table, make_model(model))
-    write_table(output, table, columns)
+        values = compute(air, table, make_model(model))
+    write_table(output, table, columns, values)
 
 
 def read_table(path: Path) -> Table:
@@ -93,27 +96,21 @@ def _numbers(where: str, header: list[str], row: list[str]) -> list[float]:
     if len(row) != len(header):
         raise InputError(f"{where}: {len(row)} values, expected {len(header)}")
     numbers = []
-    for name, (lowest, highest) in COLUMNS.items():
+    for name, column in COLUMNS.items():
         text = row[header.index(name)].strip()
-        expected = "a number" if math.isinf(lowest) else f"a number from {lowest:g} to {highest:g}"
         try:
-            number = float(text)
+            numbers.append(column.read(float(text)))
         except ValueError as error:
-            raise InputError(f"{where}, {name}: got {text!r}, expected {expected}") from error
-        if not math.isfinite(number) or not lowest <= number <= highest:
-            raise InputError(f"{where}, {name}: got {text}, expected {expected}")
-        numbers.append(number)
+            raise InputError(f"{where}: {name}: got {text!r}, expected {column.expected}") from error
     return numbers
 
 
-def compute(atmosphere: "Atmosphere", table: Table, model: "Model") -> dict[str, list[str]]:
-    """The columns to add: name -> one text per row, with the digits that its precision has."""
+def compute(atmosphere: "Atmosphere", table: Table, model: "Model") -> list[list[str]]:
+    """What to add to each row, with the digits that its precision has."""
     import equinox as eqx
     import jax
     import jax.numpy as jnp
     import numpy as np
-
-    from diffatmo.atmosphere import to_dict
 
     altitude, sun_zenith, view_zenith, view_azimuth = np.asarray(table.numbers).T
     degrees = np.radians(np.stack([sun_zenith, view_zenith, view_azimuth]))
@@ -129,12 +126,16 @@ def compute(atmosphere: "Atmosphere", table: Table, model: "Model") -> dict[str,
         rows = np.minimum(np.arange(start, start + size), len(table.rows) - 1)
         rays = [jnp.asarray(array[rows], jnp.result_type(float)) for array in (altitude, view, sun)]
         parts.append(jax.device_get(answer(sky, rays)))
+    values = np.concatenate([np.concatenate(part, axis=-1) for part in parts])[: len(table.rows)]
+    return [[str(number) for number in row] for row in values]
+
+
+def new_columns(atmosphere: "Atmosphere") -> list[str]:
+    """Names of the columns to add."""
+    from diffatmo.atmosphere import to_dict
+
     names = [label(wavelength) for wavelength in to_dict(atmosphere)["wavelengths_nm"]]
-    columns = {}
-    for quantity in ("radiance", "transmittance"):
-        values = np.concatenate([getattr(part, quantity) for part in parts])[: len(table.rows)]
-        columns |= {f"{quantity}_{name}": [str(x) for x in values[:, i]] for i, name in enumerate(names)}
-    return columns
+    return [f"{quantity}_{name}" for quantity in ("radiance", "transmittance") for name in names]
 
 
 def label(wavelength: float) -> str:
@@ -146,17 +147,12 @@ def _direction(zenith: "np.ndarray", azimuth: "np.ndarray") -> "np.ndarray":
     """Unit vectors in the local frame: x east, y north (here towards the sun), z up."""
     import numpy as np
 
-    return np.stack(
-        [np.sin(zenith) * np.sin(azimuth), np.sin(zenith) * np.cos(azimuth), np.cos(zenith)], axis=-1
-    )
+    return np.stack([np.sin(zenith) * np.sin(azimuth), np.sin(zenith) * np.cos(azimuth), np.cos(zenith)], axis=-1)
 
 
-def write_table(path: Path, source: Path, table: Table, columns: dict[str, list[str]]) -> None:
+def write_table(path: Path, table: Table, columns: list[str], values: list[list[str]]) -> None:
     """Write the table's own columns as they were, then the new ones."""
-    taken = sorted(set(columns) & set(table.header))
-    if taken:
-        raise InputError(f"{source}: has a column {taken[0]} already")
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow([*table.header, *columns])
-        writer.writerows([*row, *new] for row, new in zip(table.rows, zip(*columns.values(), strict=True), strict=True))
+        writer.writerows([*row, *new] for row, new in zip(table.rows, values, strict=True))

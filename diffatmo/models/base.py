@@ -44,9 +44,7 @@ class Sky(eqx.Module):
     atmosphere: eqx.AbstractVar[Atmosphere]
 
     @abstractmethod
-    def path(
-        self, *, altitude: Altitude, mu: Cosine, mu_s: Cosine, nu: Cosine, distance: Length | None = None
-    ) -> Path:
+    def path(self, *, altitude: Altitude, mu: Cosine, mu_s: Cosine, nu: Cosine, distance: Length | None = None) -> Path:
         """Inscattered radiance and transmittance to the boundary, or to ``distance`` km if that is nearer.
 
         ``altitude`` km, ``mu`` and ``mu_s`` the cosines of the zenith angles of view and sun, ``nu`` the cosine between

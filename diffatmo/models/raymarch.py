@@ -14,20 +14,17 @@ class RayMarch(Model):
     steps: int = 12
 
     def sky(self, atmosphere: Atmosphere) -> "RayMarchSky":
-        """Tabulate the columns towards the sun."""
-        return RayMarchSky(atmosphere, transmittance.Columns.build(atmosphere), self.steps)
+        """Nothing to prepare."""
+        return RayMarchSky(atmosphere, self.steps)
 
 
 class RayMarchSky(Sky):
     """A sky of light scattered once, over a ground lit by the sun alone."""
 
     atmosphere: Atmosphere
-    columns: transmittance.Columns
     steps: int
 
-    def path(
-        self, *, altitude: Altitude, mu: Cosine, mu_s: Cosine, nu: Cosine, distance: Length | None = None
-    ) -> Path:
+    def path(self, *, altitude: Altitude, mu: Cosine, mu_s: Cosine, nu: Cosine, distance: Length | None = None) -> Path:
         """Inscattered radiance and transmittance to the boundary, or to ``distance`` km if that is nearer."""
         atmosphere, radius = self.atmosphere, self.atmosphere.bottom_radius
         altitude, mu, mu_s, nu = jnp.broadcast_arrays(altitude, mu, mu_s, nu)
@@ -40,16 +37,14 @@ class RayMarchSky(Sky):
             end = geometry.distance_to_boundary(altitude, mu, ground, radius, atmosphere.top_altitude)
             steps = 4 * self.steps
             nodes = rays.straight(altitude, mu, jnp.clip(distance - moved, 0, end), radius, steps)
-        single = scattering.integrate(
-            atmosphere, self.columns, altitude, mu, mu_s, nu, ground, steps=steps, nodes=nodes
-        )
+        single = scattering.integrate(atmosphere, altitude, mu, mu_s, nu, ground, steps=steps, nodes=nodes)
         light = scattering.radiance(atmosphere, single, nu)
         return Path(jnp.where(misses[..., None], 0, light), jnp.where(misses[..., None], 1, single.transmittance))
 
     def sun_irradiance(self, *, altitude: Altitude, mu_s: Cosine) -> Irradiance:
         """Direct irradiance of the sun on a horizontal plane."""
         falling = jnp.maximum(mu_s, 0)[..., None] * self.atmosphere.solar_irradiance
-        return falling * transmittance.sun_transmittance(self.atmosphere, self.columns, altitude, mu_s)
+        return falling * transmittance.to_sun(self.atmosphere, altitude, mu_s)
 
     def sky_irradiance(self, *, mu_s: Cosine) -> Irradiance:
         """Zero: this model's ground sees the sun only."""

@@ -1,14 +1,14 @@
-"""What is to be fitted, as the user describes it: a scene file, or images with options. Nothing is opened here but TOML."""
+"""What is to be fitted, as the user describes it: a scene file, or images with options."""
 
 import difflib
-import math
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from diffatmo.cli.common import MODELS, InputError
+from diffatmo.cli.common import InputError
+from diffatmo.cli.keys import CAMERA_KEYS, PLACE_KEYS, Key, Number, Word, check_camera_options, read
 
 FREE = (
     "rayleigh_scattering",
@@ -23,92 +23,33 @@ FREE = (
 """Parameters that are free unless the user says otherwise."""
 
 
-@dataclass(frozen=True)
-class Number:
-    """A key whose value is a number from ``lowest`` to ``highest``, above ``lowest`` where ``positive``."""
-
-    help: str
-    lowest: float = -math.inf
-    highest: float = math.inf
-    positive: bool = False
-
-    @property
-    def expected(self) -> str:
-        """The accepted values in words."""
-        if math.isinf(self.highest):
-            lowest = f" above {self.lowest:g}" if self.positive else f" of at least {self.lowest:g}"
-            return "a number" + ("" if math.isinf(self.lowest) else lowest)
-        return f"a number {'above' if self.positive else 'from'} {self.lowest:g} {'up ' * self.positive}to {self.highest:g}"
-
-    def read(self, value: Any) -> float:
-        """The value, or :class:`ValueError`."""
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-            raise ValueError
-        if not self.lowest <= value <= self.highest or (self.positive and value == self.lowest):
-            raise ValueError
-        return float(value)
-
-
-@dataclass(frozen=True)
-class Word:
-    """A key whose value is one of ``choices``, or any text where there are none."""
-
-    help: str
-    choices: tuple[str, ...] = ()
-
-    @property
-    def expected(self) -> str:
-        """The accepted values in words."""
-        return " or ".join(f'"{choice}"' for choice in self.choices) if self.choices else "text"
-
-    def read(self, value: Any) -> str:
-        """The value, or :class:`ValueError`."""
-        if not isinstance(value, str) or not value or (self.choices and value not in self.choices):
-            raise ValueError
-        return value
-
-
-@dataclass(frozen=True)
-class Flag:
-    """A key whose value is true or false."""
-
-    help: str
-    expected: str = "true or false"
-
-    def read(self, value: Any) -> bool:
-        """The value, or :class:`ValueError`."""
-        if not isinstance(value, bool):
-            raise ValueError
-        return value
-
-
-IMAGE_KEYS: dict[str, Number | Word | Flag] = {
-    "projection": Word("How pixels map to directions.", ("equirectangular", "fisheye", "pinhole")),
-    "upper": Flag("The equirectangular picture ends at the horizon."),
-    "fov_deg": Number("Field of view: across the circle of a fisheye, top to bottom of a pinhole.", 0, 360, True),
-    "yaw_deg": Number("Azimuth of the optical axis, clockwise from north."),
-    "pitch_deg": Number("Elevation of the optical axis.", -90, 90),
-    "roll_deg": Number("Roll about the optical axis."),
-    "altitude_km": Number("Height of the camera above the ground.", 0),
-    "sun_zenith_deg": Number("Zenith angle of the sun.", 0, 108),
-    "sun_azimuth_deg": Number("Azimuth of the sun, clockwise from north."),
+IMAGE_KEYS: dict[str, Key] = {
+    **CAMERA_KEYS,
+    **PLACE_KEYS,
+    "sun_zenith_deg": Number("Zenith angle of the sun; above 90 it is below the horizon.", 0, 108),
     "sun": Word("Find the sun in the picture.", ("detect",)),
     "exposure": Word("fixed, free, free-per-channel, or the name of a group of images that share one."),
-    "noise": Number("Relative standard deviation per pixel and channel.", 0, 10, True),
-    "view_zenith_max_deg": Number("Use pixels up to this zenith angle: 90 is the sky, 180 the ground too.", 0, 180, True),
-    "sun_exclusion_deg": Number("Leave out pixels nearer to the sun.", 0, 180),
-    "horizon_exclusion_deg": Number("Leave out pixels nearer to the horizon.", 0, 90),
+    "noise": Number("Relative standard deviation per pixel and channel.", 0, 10),
+    "noise_shot": Number("Variance per unit of signal (photon noise).", 0),
+    "noise_floor": Number("Standard deviation of a dark pixel (read noise).", 0),
+    "saturation": Number("Leave out pixels with a channel at or above this value.", 0, positive=True),
+    "view_zenith_max_deg": Number("Use pixels up to this zenith angle: 90 the sky, 180 the ground too.", 0, 180, True),
+    "sun_exclusion_deg": Number("Leave out pixels nearer to the sun.", 0, 179),
+    "horizon_exclusion_deg": Number("Leave out pixels nearer to the horizon.", 0, 89),
     "mask": Word("A picture that is black where pixels are to be left out."),
     "transfer": Word("Transfer function of an 8-bit picture.", ("srgb", "linear")),
 }
 """The keys of an ``[[image]]``, each also an option of the command line."""
+
+MODELS = ("moments", "raymarch")
+"""The models that have derivatives."""
 
 SCENE_KEYS = ("init", "free", "scaled", "model", "max_steps", "image")
 
 
 @dataclass(frozen=True)
 class ImageSpec:
-    """One image to be fitted. ``options`` holds the ``IMAGE_KEYS`` that were given; the image's header gives the rest."""
+    """One image to be fitted; ``options`` holds the ``IMAGE_KEYS`` that were given, its header gives the rest."""
 
     file: Path
     options: Mapping[str, Any] = field(default_factory=dict)
@@ -130,25 +71,11 @@ class FitSpec:
         return replace(self, **{key: value for key, value in given.items() if value is not None})
 
 
-def read_image_key(key: str, value: Any) -> Any:
-    """The value of one key of an image, checked."""
-    try:
-        return IMAGE_KEYS[key].read(value)
-    except ValueError as error:
-        raise InputError(f"{key}: got {value!r}, expected {IMAGE_KEYS[key].expected}") from error
-
-
 def check_image_options(options: Mapping[str, Any]) -> None:
     """Refuse options of one image that contradict each other."""
     if "sun" in options and ("sun_zenith_deg" in options or "sun_azimuth_deg" in options):
         raise InputError('sun = "detect" contradicts sun_zenith_deg and sun_azimuth_deg: give one or the other')
-    projection = options.get("projection")
-    if options.get("upper") and projection not in (None, "equirectangular"):
-        raise InputError(f'upper = true contradicts projection = "{projection}": it belongs to "equirectangular"')
-    if "fov_deg" in options and projection == "equirectangular":
-        raise InputError('fov_deg contradicts projection = "equirectangular", which shows the whole sphere')
-    if projection == "pinhole" and options.get("fov_deg", 0) >= 180:
-        raise InputError(f'fov_deg: got {options["fov_deg"]:g}, expected less than 180 for projection = "pinhole"')
+    check_camera_options(options)
 
 
 def read_scene(path: Path) -> FitSpec:
@@ -181,8 +108,8 @@ def _scene(data: Mapping[str, Any], directory: Path) -> FitSpec:
         # A file beside the scene comes before a preset of the same name.
         init = str(directory / init) if (directory / init).exists() or init.endswith(".toml") else init
     model = data.get("model")
-    if model is not None and model not in MODELS:
-        raise InputError(f"model: got {model!r}, expected {' or '.join(MODELS)}")
+    if model is not None:
+        model = read(Word("How the sky is computed.", MODELS), "model", model)
     max_steps = data.get("max_steps")
     if max_steps is not None and (isinstance(max_steps, bool) or not isinstance(max_steps, int) or max_steps < 1):
         raise InputError(f"max_steps: got {max_steps!r}, expected a whole number of at least 1")
@@ -194,7 +121,7 @@ def _image(table: Mapping[str, Any], directory: Path) -> ImageSpec:
     file = table.get("file")
     if not isinstance(file, str) or not file:
         raise InputError("file: missing, expected the name of an image file")
-    options = {key: read_image_key(key, value) for key, value in table.items() if key != "file"}
+    options = {key: read(IMAGE_KEYS[key], key, value) for key, value in table.items() if key != "file"}
     if "mask" in options:
         options["mask"] = str(directory / options["mask"])
     check_image_options(options)

@@ -1,0 +1,153 @@
+"""From an image file, and what is said about it, to an observation that can be fitted."""
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from diffatmo.cli.common import InputError
+from diffatmo.cli.keys import CAMERA_KEYS, make_camera
+from diffatmo.cli.scenefile import ImageSpec
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from diffatmo.atmosphere import Atmosphere
+    from diffatmo.camera import Camera
+    from diffatmo.imageio import Image
+    from diffatmo.scene import Shot
+    from fitting import Observation
+
+NOISE_KEYS = ("noise", "noise_shot", "noise_floor")
+"""Also looked for among the notes in an image's header."""
+
+SAME_WAVELENGTH_NM = 0.01
+
+
+def observe(spec: ImageSpec, name: str, init: "Atmosphere") -> "tuple[Observation, Atmosphere | None]":
+    """The image as an observation called ``name``, and the true atmosphere if the image carries it.
+
+    What ``spec`` does not say is taken from the image's header; what neither says is asked for.
+    """
+    import fitting
+    from diffatmo import imageio, scene
+
+    options = spec.options
+    image = imageio.read_image(spec.file, transfer=options.get("transfer"))
+    shot = scene.from_image(spec.file, image) if scene.ATTRIBUTE in image.metadata else None
+    try:
+        pixels = in_order(image, init)
+        camera = find_camera(options, pixels, shot)
+        chosen: dict[str, Any] = {key: options[key] for key in ("exposure", "saturation") if key in options}
+        chosen |= {
+            key.removesuffix("_deg"): math.radians(options[key])
+            for key in ("view_zenith_max_deg", "sun_exclusion_deg", "horizon_exclusion_deg")
+            if key in options
+        }
+        notes = shot.notes if shot else {}
+        chosen |= {key: options.get(key, notes.get(key)) for key in NOISE_KEYS if key in options or key in notes}
+        observation = fitting.observe(
+            pixels,
+            camera=camera,
+            altitude=find_altitude(options, shot),
+            sun=find_sun(options, pixels, camera, shot),
+            mask=read_mask(Path(options["mask"])) if "mask" in options else None,
+            exposure_value=float(shot.scene.exposure) if shot else 1.0,
+            name=name,
+            **chosen,
+        )
+    except ValueError as error:
+        raise InputError(f"{spec.file}: {str(error).removeprefix(f'{name}: ')}") from error
+    return observation, shot.scene.atmosphere if shot else None
+
+
+def in_order(image: "Image", init: "Atmosphere") -> "np.ndarray":
+    """The pixels with their channels in the order of the atmosphere's wavelengths."""
+    import numpy as np
+
+    wanted = np.asarray(init.wavelengths, dtype=float)
+    count = image.pixels.shape[-1]
+    if count != wanted.size:
+        raise InputError(
+            f"{count} channels, but the atmosphere of the fit has {wanted.size} wavelengths ({_list(wanted)})"
+        )
+    if image.wavelengths is not None:
+        own = np.asarray(image.wavelengths, dtype=float)
+        order = np.argsort(own)[np.argsort(np.argsort(wanted))]
+        if np.any(np.abs(own[order] - wanted) > SAME_WAVELENGTH_NM):
+            raise InputError(f"wavelengths {_list(own)}, but the atmosphere of the fit has {_list(wanted)}")
+    elif count == 3:
+        # Red, green, blue: the longest wavelength first.
+        order = np.argsort(np.argsort(-wanted))
+    else:
+        order = np.arange(count)
+    return image.pixels[..., order]
+
+
+def find_camera(options: Mapping[str, Any], pixels: "np.ndarray", shot: "Shot | None") -> "Camera":
+    """The camera that took the picture."""
+    from diffatmo import camera
+
+    described = {key: options[key] for key in CAMERA_KEYS if key in options}
+    if shot and not described:
+        return shot.scene.camera
+    if shot and described.get("projection") in (None, camera.to_dict(shot.scene.camera)["projection"]):
+        described = camera.to_dict(shot.scene.camera) | described
+    elif "projection" not in described:
+        raise _unknown("projection")
+    height, width = pixels.shape[:2]
+    if described["projection"] == "equirectangular":
+        if "upper" not in described:
+            described["upper"] = width == 4 * height
+        if width != 2 * height and not (described["upper"] and width == 4 * height):
+            shapes = "2:1, or 4:1 if it ends at the horizon"
+            raise InputError(f"{width} x {height} pixels, expected {shapes}, for projection equirectangular")
+    return make_camera(described, height=height, width=width)
+
+
+def find_altitude(options: Mapping[str, Any], shot: "Shot | None") -> float:
+    """Where the picture was taken, km above the ground."""
+    if "altitude_km" in options:
+        return options["altitude_km"]
+    if shot is None:
+        raise _unknown("altitude_km")
+    return float(shot.scene.altitude)
+
+
+def find_sun(options: Mapping[str, Any], pixels: "np.ndarray", camera: "Camera", shot: "Shot | None") -> "np.ndarray":
+    """Unit vector to the sun."""
+    import numpy as np
+
+    from diffatmo import sun
+
+    if "sun" in options:
+        return sun.find(pixels, camera).direction
+    keys = ("sun_zenith_deg", "sun_azimuth_deg")
+    known: dict[str, float] = {}
+    if shot:
+        known = dict(zip(keys, np.degrees(sun.angles(shot.scene.sun)).tolist(), strict=True))
+        if not any(key in options for key in keys):
+            return np.asarray(shot.scene.sun)
+    known |= {key: options[key] for key in keys if key in options}
+    for key in keys:
+        if key not in known:
+            raise _unknown(key)
+    zenith, azimuth = (math.radians(known[key]) for key in keys)
+    return np.asarray(sun.direction(zenith=zenith, azimuth=azimuth))
+
+
+def read_mask(path: Path) -> "np.ndarray":
+    """True where the picture is not black."""
+    import numpy as np
+
+    from diffatmo import imageio
+
+    return np.any(imageio.read_image(path, transfer="linear").pixels > 0, axis=-1)
+
+
+def _unknown(key: str) -> InputError:
+    return InputError(f"{key} is not known: the image does not carry it, so it has to be given")
+
+
+def _list(wavelengths: "np.ndarray") -> str:
+    return ", ".join(f"{nm:g}" for nm in wavelengths) + " nm"

@@ -1,0 +1,156 @@
+"""Kinds of values that users give, in files and on the command line: what each accepts, and how it is refused."""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from diffatmo.cli.common import InputError
+
+if TYPE_CHECKING:
+    from diffatmo.camera import Camera
+
+
+@dataclass(frozen=True)
+class Number:
+    """A key whose value is a number from ``lowest`` to ``highest``, above ``lowest`` where ``positive``."""
+
+    help: str
+    lowest: float = -math.inf
+    highest: float = math.inf
+    positive: bool = False
+
+    @property
+    def expected(self) -> str:
+        """The accepted values in words."""
+        if math.isinf(self.lowest):
+            return "a number"
+        lowest = f"a number above {self.lowest:g}" if self.positive else f"a number of at least {self.lowest:g}"
+        return lowest if math.isinf(self.highest) else f"{lowest} and at most {self.highest:g}"
+
+    def read(self, value: Any) -> float:
+        """The value, or :class:`ValueError`."""
+        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+            raise ValueError
+        if not self.lowest <= value <= self.highest or (self.positive and value == self.lowest):
+            raise ValueError
+        return float(value)
+
+
+@dataclass(frozen=True)
+class Word:
+    """A key whose value is one of ``choices``, or any text where there are none."""
+
+    help: str
+    choices: tuple[str, ...] = ()
+
+    @property
+    def expected(self) -> str:
+        """The accepted values in words."""
+        return " or ".join(f'"{choice}"' for choice in self.choices) if self.choices else "text"
+
+    def read(self, value: Any) -> str:
+        """The value, or :class:`ValueError`."""
+        if not isinstance(value, str) or not value or (self.choices and value not in self.choices):
+            raise ValueError
+        return value
+
+
+@dataclass(frozen=True)
+class Flag:
+    """A key whose value is true or false."""
+
+    help: str
+    expected: str = "true or false"
+
+    def read(self, value: Any) -> bool:
+        """The value, or :class:`ValueError`."""
+        if not isinstance(value, bool):
+            raise ValueError
+        return value
+
+
+Key = Number | Word | Flag
+
+CAMERA_KEYS: dict[str, Key] = {
+    "projection": Word("How pixels map to directions.", ("equirectangular", "fisheye", "pinhole")),
+    "upper": Flag("The equirectangular picture ends at the horizon."),
+    "fov_deg": Number("Field of view: across the circle of a fisheye, top to bottom of a pinhole.", 0, 360, True),
+    "yaw_deg": Number("Azimuth of the optical axis, clockwise from north."),
+    "pitch_deg": Number("Elevation of the optical axis.", -90, 90),
+    "roll_deg": Number("Clockwise turn of the camera about its optical axis."),
+}
+"""How a camera is described."""
+
+PLACE_KEYS: dict[str, Key] = {
+    "altitude_km": Number("Height of the camera above the ground.", 0),
+    "sun_zenith_deg": Number("Zenith angle of the sun; above 90 it is below the horizon.", 0, 180),
+    "sun_azimuth_deg": Number("Azimuth of the sun, clockwise from north."),
+}
+"""Where the camera and the sun are."""
+
+
+def read(key: Key, name: str, value: Any) -> Any:
+    """``value``, checked; raises :class:`InputError` naming the key and what it accepts."""
+    try:
+        return key.read(value)
+    except ValueError as error:
+        raise InputError(f"{name}: got {value!r}, expected {key.expected}") from error
+
+
+def options(keys: Mapping[str, Key], shown: Mapping[str, Any] | None = None) -> Callable[[Any], Any]:
+    """A decorator that adds an option for each key: ``--sun-zenith-deg`` for ``sun_zenith_deg``, None if not given.
+
+    ``shown`` are the defaults that the help mentions.
+    """
+
+    def decorate(command: Any) -> Any:
+        for name, key in reversed(list(keys.items())):
+            flag, metavar = flag_of(name), None
+            kind: click.ParamType | None = None
+            default = f"  [default: {shown[name]}]" if shown and name in shown else ""
+            if isinstance(key, Flag):
+                flag += f"/--no-{name.replace('_', '-')}"
+            elif isinstance(key, Number):
+                kind, metavar = click.FLOAT, "NUMBER"
+            elif key.choices:
+                kind = click.Choice(key.choices)
+            command = click.option(flag, name, type=kind, metavar=metavar, default=None, help=key.help + default)(
+                command
+            )
+        return command
+
+    return decorate
+
+
+def flag_of(name: str) -> str:
+    """The option of a key."""
+    return f"--{name.replace('_', '-')}"
+
+
+def given(keys: Mapping[str, Key], values: Mapping[str, Any]) -> dict[str, Any]:
+    """Those of the options of ``keys`` that were given on the command line, checked."""
+    return {name: read(key, flag_of(name), values[name]) for name, key in keys.items() if values[name] is not None}
+
+
+def check_camera_options(options: Mapping[str, Any]) -> None:
+    """Refuse a description of a camera that contradicts itself."""
+    projection = options.get("projection")
+    if options.get("upper") and projection not in (None, "equirectangular"):
+        raise InputError(f"upper contradicts projection {projection}: it belongs to equirectangular")
+    if "fov_deg" in options and projection == "equirectangular":
+        raise InputError("fov_deg contradicts projection equirectangular, which shows the whole sphere or half of it")
+    if projection == "pinhole" and options.get("fov_deg", 0) >= 180:
+        raise InputError(f"fov_deg: got {options['fov_deg']:g}, expected less than 180 for projection pinhole")
+
+
+def make_camera(description: Mapping[str, Any], *, height: int, width: int) -> "Camera":
+    """The camera described by ``CAMERA_KEYS``; what is missing takes its default."""
+    from diffatmo import camera
+
+    data = {**description, "height": height, "width": width}
+    if data["projection"] == "pinhole" and "fov_deg" in data:
+        data["fov_y_deg"] = data.pop("fov_deg")
+    return camera.from_dict(data)

@@ -1,0 +1,129 @@
+"""``diffatmo render``: a picture of an atmosphere's sky."""
+
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from diffatmo.cli import keys
+from diffatmo.cli.common import (
+    InputError,
+    check_output,
+    make_model,
+    model_option,
+    overwrite_option,
+    read_atmosphere,
+)
+from diffatmo.cli.keys import CAMERA_KEYS, PLACE_KEYS, Number
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from diffatmo.render import Scene
+
+EXPOSURE = {
+    "exposure": Number("Pixels are radiance times this.  [default: 1; for PNG, by the picture]", 0, positive=True)
+}
+DEFAULTS = {"projection": "equirectangular", "altitude_km": 0.1, "sun_zenith_deg": 45.0, "sun_azimuth_deg": 0.0}
+DEFAULT_WIDTH = 512
+SIZE = click.IntRange(1, 16384)
+
+
+@click.command()
+@click.argument("atmosphere", metavar="ATM.toml")
+@click.option(
+    "-o",
+    "--output",
+    "outputs",
+    metavar="IMAGE",
+    type=click.Path(path_type=Path),
+    multiple=True,
+    required=True,
+    help="File to write, .exr or .png; may be given more than once.",
+)
+@model_option
+@click.option("--width", type=SIZE, help="Pixels across.  [default: 512]")
+@click.option("--height", type=SIZE, help="Pixels down.  [default: by the projection]")
+@keys.options(CAMERA_KEYS, DEFAULTS)
+@keys.options(PLACE_KEYS, DEFAULTS)
+@keys.options(EXPOSURE)
+@click.option("--sun-disc", is_flag=True, help="Draw the disc of the sun.")
+@overwrite_option
+def render(
+    atmosphere: str,
+    outputs: tuple[Path, ...],
+    model: str,
+    width: int | None,
+    height: int | None,
+    sun_disc: bool,
+    overwrite: bool,
+    **values: Any,
+) -> None:
+    """Render a picture of the sky.
+
+    ATM.toml is an atmosphere file or the name of a preset. An EXR holds linear radiance at every wavelength and, in its
+    header, everything that it was made from; a PNG is developed for the screen.
+    """
+    given = keys.given(CAMERA_KEYS | PLACE_KEYS | EXPOSURE, values)
+    options: dict[str, Any] = DEFAULTS | given
+    keys.check_camera_options(options)
+    writers = [(path, _writer(path)) for path in outputs]
+    for path in outputs:
+        check_output(path, overwrite=overwrite)
+    import numpy as np
+
+    from diffatmo import render, sun
+
+    air = read_atmosphere(atmosphere)
+    width, height = picture_size(options, width, height)
+    camera = keys.make_camera({k: v for k, v in options.items() if k in CAMERA_KEYS}, height=height, width=width)
+    scene = render.Scene(
+        atmosphere=air,
+        camera=camera,
+        altitude=options["altitude_km"],
+        sun=sun.direction(
+            zenith=math.radians(options["sun_zenith_deg"]), azimuth=math.radians(options["sun_azimuth_deg"])
+        ),
+        exposure=options.get("exposure", 1.0),
+    )
+    pixels = np.asarray(render.render(scene, make_model(model), sun_disc=sun_disc))
+    for path, write in writers:
+        write(path, pixels, scene, {"model": model, "sun_disc": sun_disc}, "exposure" not in given)
+
+
+def picture_size(options: Mapping[str, Any], width: int | None, height: int | None) -> tuple[int, int]:
+    """(width, height), with square pixels where one of them is not said."""
+    projection = options["projection"]
+    ratio = {"equirectangular": 4 if options.get("upper") else 2, "fisheye": 1, "pinhole": 1.5}[projection]
+    if width is None:
+        width = round(height * ratio) if height is not None else DEFAULT_WIDTH
+    return width, height if height is not None else max(1, round(width / ratio))
+
+
+def _writer(path: Path) -> Callable[..., None]:
+    writers = {".exr": _write_exr, ".png": _write_png}
+    if path.suffix.lower() not in writers:
+        raise InputError(f"{path}: expected a name that ends in .exr or .png")
+    return writers[path.suffix.lower()]
+
+
+def _write_exr(path: Path, pixels: "np.ndarray", scene: "Scene", notes: dict[str, Any], automatic: bool) -> None:
+    from diffatmo import scene as scenes
+
+    del automatic  # An EXR is for numbers: its exposure is what was asked for.
+    scenes.save(path, pixels, scene, notes=notes, overwrite=True)
+
+
+def _write_png(path: Path, pixels: "np.ndarray", scene: "Scene", notes: dict[str, Any], automatic: bool) -> None:
+    import jax.numpy as jnp
+    import numpy as np
+
+    from diffatmo import color, imageio
+
+    del notes
+    wavelengths, radiance = scene.atmosphere.wavelengths, jnp.asarray(pixels)
+    rgb = color.to_linear_srgb(radiance, wavelengths=wavelengths)
+    codes = color.display(radiance, wavelengths=wavelengths, exposure=color.auto_exposure(rgb) if automatic else 1.0)
+    imageio.write_png(path, np.asarray(codes), overwrite=True)

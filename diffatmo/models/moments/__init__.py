@@ -1,0 +1,86 @@
+"""Multiple scattering by angular moments: the default model, made for fitting.
+
+The source of multiple scattering needs only low angular moments of the radiance: Rayleigh's phase function *is* of degree 2,
+and the peak of the aerosol's is treated analytically. With the sun in direction (mu_s) and a field that is even about the
+sun's plane, the moments of the radiance L at altitude h are
+
+    M_lm(h, mu_s) = ∫ L(ω) N_lm Π_lm(mu) (sinθ / sinθ_s)^m cos(m φ) dω,
+
+with Π_lm the derivative d^m P_l / dmu^m and N_lm the squared norm of the real spherical harmonic, and the source is
+
+    J(ω) = Σ_lm (β_R χ^R_l + β_M χ^M_l) M_lm Π_lm(mu) C_m(w, q),    C_m = (sinθ sinθ_s)^m cos(m φ).
+
+C_m is a polynomial in w = nu - mu mu_s and q = (1 - mu²)(1 - mu_s²), so nothing here has a singular direction: the sun at
+the zenith is a point like any other, for value and derivative.
+
+1. First order: exact phase functions along every ray (:mod:`diffatmo.scattering`); its moments seed the iteration.
+2. Each further order is linear in the last, M ← M¹ + K M: for every (h, mu_s) node and direction, integrate T J to the ground
+   or the top, add the Lambertian ground, project. Positions, weights and polynomials depend on the planet only
+   (:mod:`.shell`); T and β are the parameters' (:mod:`.solve`). A geometric tail closes the series.
+3. One last gather along the rays of the image, with the moments of the first order to a high degree (:mod:`.sky`).
+4. Repeated forward scattering beyond that degree (the aureole): Σ_{n≥2} β_M T_sun τ^{n-1}/(n-1)! [P^(n) - its truncation].
+"""
+
+from diffatmo._types import Scalar
+from diffatmo.atmosphere import Atmosphere
+from diffatmo.models.base import Model
+from diffatmo.models.moments.shell import Directions, Shell, build
+from diffatmo.models.moments.sky import MomentsSky, MomentsView, Resolution
+from diffatmo.models.moments.solve import solve
+
+__all__ = ["Moments", "MomentsSky", "MomentsView", "Shell"]
+
+
+class Moments(Model):
+    """The default model. Fields are resolutions; the defaults keep the sky within about 0.1 % of Monte Carlo."""
+
+    altitudes: int = 14
+    suns: int = 26
+    first: Directions = Directions(sky=14, ground=6, azimuths=6, steps=6)
+    higher: Directions = Directions(sky=8, ground=5, azimuths=6, steps=4)
+    peak_azimuths: int = 32
+    orders: int = 5
+    first_degree: int = 8
+    higher_degree: int = 5
+    iteration_degree: int = 2
+    view_steps: int = 8
+    view_sky: int = 32
+    view_ground: int = 20
+    view_columns: int = 12
+    view_fine_columns: int = 32
+
+    def shell(self, *, bottom_radius: Scalar, top_altitude: Scalar) -> Shell:
+        """Geometry of a planet (km): nodes, rays and interpolation weights. A fit computes it once."""
+        return build(
+            bottom_radius,
+            top_altitude,
+            altitudes=self.altitudes,
+            suns=self.suns,
+            first=self.first,
+            higher=self.higher,
+            degree=self.iteration_degree,
+        )
+
+    def sky(self, atmosphere: Atmosphere, shell: Shell | None = None) -> MomentsSky:
+        """Solve for the moments. ``shell`` is :meth:`shell` of the same planet, where it is known already."""
+        if shell is None:
+            shell = self.shell(bottom_radius=atmosphere.bottom_radius, top_altitude=atmosphere.top_altitude)
+        state = solve(
+            atmosphere,
+            shell,
+            orders=self.orders,
+            first_degree=self.first_degree,
+            iteration_degree=self.iteration_degree,
+            higher_degree=self.higher_degree,
+            peak_azimuths=self.peak_azimuths,
+        )
+        resolution = Resolution(
+            self.first_degree,
+            self.higher_degree,
+            self.view_steps,
+            self.view_sky,
+            self.view_ground,
+            self.view_columns,
+            self.view_fine_columns,
+        )
+        return MomentsSky(atmosphere, shell, state, resolution)

@@ -1,0 +1,292 @@
+"""From moments to radiance: the last gather, along the rays that are looked at."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from diffatmo import geometry, phase, rays, scattering, table, transmittance
+from diffatmo._types import Altitude, Cosine, Direction, Irradiance, Length, Scalar, Transmittance
+from diffatmo.atmosphere import Atmosphere
+from diffatmo.models.base import Path, Ray, Sky, View
+from diffatmo.models.moments.angular import basis, degrees_of
+from diffatmo.models.moments.shell import Shell, dusk
+from diffatmo.models.moments.solve import State, source_moments
+from diffatmo.numerics import safe_divide, safe_sqrt
+
+ZENITH_WIDTH = 0.02
+"""Half-width of the range of nu tabulated where view or sun is at the zenith, and azimuth has no meaning."""
+
+SKY_LINEAR = 0.02
+GROUND_LINEAR = 0.1
+"""Linear parts of the maps of the view's rows: mu above the horizon, distance to the ground below it."""
+
+
+class Resolution(NamedTuple):
+    """Static sizes of the gather: degrees of the moments, nodes along a ray, and the tables of a view."""
+
+    first_degree: int
+    higher_degree: int
+    steps: int
+    sky_rows: int
+    ground_rows: int
+    columns: int
+    fine_columns: int
+
+
+def aureole_phase(atmosphere: Atmosphere, nu: Cosine, order: int, degree: int) -> Float[Array, "..."]:
+    """Phase function of ``order`` aerosol scatterings in a row, less its moments up to ``degree``, sr^-1.
+
+    Henyey-Greenstein convolved n times with itself has the moments (g^l)^n, and is Henyey-Greenstein with g^n. The peak of
+    Cornette-Shanks is that of Henyey-Greenstein times 3 / (2 + g²).
+    """
+    g = atmosphere.mie_g**order
+    height = 1.0 if atmosphere.mie_phase == "henyey-greenstein" else (3 / (2 + atmosphere.mie_g**2)) ** order
+    kept = ((2 * np.arange(degree + 1) + 1) / (4 * np.pi)).astype(nu.dtype)
+    low = phase.legendre(degree, nu) @ (kept * phase.mie_moments(g, degree, "henyey-greenstein"))
+    return height * (phase.henyey_greenstein(nu, g) - low)
+
+
+class MomentsSky(Sky):
+    """The solved moments of one atmosphere."""
+
+    atmosphere: Atmosphere
+    shell: Shell
+    state: State
+    resolution: Resolution = eqx.field(static=True)
+
+    def path(self, *, altitude: Altitude, mu: Cosine, mu_s: Cosine, nu: Cosine, distance: Length | None = None) -> Path:
+        """Inscattered radiance and transmittance to the boundary, or to ``distance`` km if that is nearer."""
+        atmosphere, radius, top = self.atmosphere, self.atmosphere.bottom_radius, self.atmosphere.top_altitude
+        altitude, mu, mu_s, nu = jnp.broadcast_arrays(altitude, mu, mu_s, nu)
+        altitude, mu, mu_s, moved, misses = geometry.enter_atmosphere(altitude, mu, mu_s, nu, radius, top)
+        ground = geometry.hits_ground(altitude, mu, radius)
+        steps, cut_nodes = self.resolution.steps, None
+        nodes = rays.trace(altitude, mu, ground, radius, top, steps)
+        if distance is not None:
+            end = geometry.distance_to_boundary(altitude, mu, ground, radius, top)
+            steps = 6 * steps
+            nodes = cut_nodes = rays.straight(altitude, mu, jnp.clip(distance - moved, 0, end), radius, steps)
+        single = scattering.integrate(
+            atmosphere, altitude, mu, mu_s, nu, ground,
+            steps=steps, aureole=scattering.AUREOLE_ORDERS, nodes=cut_nodes,
+        )  # fmt: skip
+        light = scattering.radiance(atmosphere, single, nu)
+        for phase_, term in zip(self.aureole_phases(nu), single.aureole, strict=True):
+            light = light + phase_[..., None] * term
+        mu_here = geometry.mu_along(altitude[..., None], mu[..., None], nodes.distance, radius)
+        mu_s_here = geometry.mu_s_along(
+            altitude[..., None], mu[..., None], mu_s[..., None], nu[..., None], nodes.distance, radius
+        )
+        i, count, w, j = self.state.moments.shape
+        by_position = jnp.moveaxis(self.state.moments, -1, 1).reshape(i, j, count * w)
+        position = self.shell.altitude_unit(nodes.altitude), self.shell.sun_unit(mu_s_here)
+        moments = table.interpolate(by_position, *position).reshape(*mu_here.shape, count, w)
+        moments = moments * dusk(mu_s_here, self.shell.grazing())[..., None, None]
+        angular = basis(
+            self.resolution.first_degree, mu_here, mu_s_here, jnp.broadcast_to(nu[..., None], mu_here.shape)
+        )
+        source = jnp.sum(moments * self._source(nodes.altitude) * angular[..., None], axis=-2)
+        light = light + jnp.sum(self._survival(altitude, mu, nodes, steps) * source, axis=-2)
+        return Path(jnp.where(misses[..., None], 0, light), jnp.where(misses[..., None], 1, single.transmittance))
+
+    def _survival(self, altitude: Altitude, mu: Cosine, nodes: rays.Nodes, steps: int) -> Float[Array, "... n w"]:
+        """Transmittance from the start of a ray to its nodes, times their weight, km."""
+        along, _ = transmittance.columns_along(self.atmosphere, altitude, mu, nodes, steps)
+        return jnp.exp(-transmittance.optical_depth(self.atmosphere, along)) * nodes.weight[..., None]
+
+    def _source(self, altitude: Altitude) -> Float[Array, "... lm w"]:
+        """Scattering coefficient times phase moment of every (l, m), km^-1."""
+        degree = self.resolution.first_degree
+        return source_moments(self.atmosphere, altitude, degree)[..., degrees_of(self.state.moments.shape[1]), :]
+
+    def aureole_phases(self, nu: Cosine) -> list[Float[Array, "..."]]:
+        """Phase functions of repeated forward scattering beyond the kept moments, orders 2, 3, …"""
+        degrees = (self.resolution.first_degree, *[self.resolution.higher_degree] * (scattering.AUREOLE_ORDERS - 1))
+        return [aureole_phase(self.atmosphere, nu, order, degree) for order, degree in enumerate(degrees, start=2)]
+
+    def sun_irradiance(self, *, altitude: Altitude, mu_s: Cosine) -> Irradiance:
+        """Direct irradiance of the sun on a horizontal plane."""
+        falling = jnp.maximum(mu_s, 0)[..., None] * self.atmosphere.solar_irradiance
+        return falling * transmittance.to_sun(self.atmosphere, altitude, mu_s)
+
+    def sky_irradiance(self, *, mu_s: Cosine) -> Irradiance:
+        """Diffuse irradiance of the sky on the ground."""
+        by_sun = self.state.irradiance.T
+        first, weights = table.cubic_weights(self.shell.sun_unit(mu_s), by_sun.shape[0])
+        value = sum(weights[..., a, None] * by_sun[first + a] for a in range(4))
+        return value * dusk(mu_s, self.shell.grazing())[..., None]
+
+    def view(self, *, altitude: Altitude, sun: Direction) -> "MomentsView":
+        """Tabulate everything that is smooth in direction for one altitude and one sun."""
+        return MomentsView.build(self, jnp.asarray(altitude, sun.dtype), sun)
+
+
+class _Rows(eqx.Module):
+    """Rows of a view's table: directions of equal mu, the sky's from the horizon up, the ground's from the nadir out."""
+
+    altitude: Scalar
+    horizon: Cosine
+    highest: Cosine
+    nadir_distance: Length
+    horizon_distance: Length
+    sky: int = eqx.field(static=True)
+    ground: int = eqx.field(static=True)
+
+    @classmethod
+    def build(cls, atmosphere: Atmosphere, altitude: Scalar, resolution: Resolution) -> "_Rows":
+        radius, top = atmosphere.bottom_radius, atmosphere.top_altitude
+        outside = altitude > top
+        # Seen from space, the sky ends where rays pass over the top.
+        over = jnp.where(outside, altitude - top, 0)
+        highest = jnp.where(outside, geometry.horizon_mu(over, radius + top), 1.0)
+        reach = safe_sqrt(altitude * (altitude + 2 * radius))
+        return cls(
+            altitude, geometry.horizon_mu(altitude, radius), highest, altitude, reach,
+            resolution.sky_rows, resolution.ground_rows,
+        )  # fmt: skip
+
+    def mu(self, radius: Scalar) -> Cosine:
+        """mu of every row."""
+        up = table.stretch(jnp.linspace(0, 1, self.sky), SKY_LINEAR)
+        sky = self.horizon + (self.highest - self.horizon) * up
+        out = table.stretch(jnp.linspace(0, 1, self.ground), GROUND_LINEAR)
+        distance = self.nadir_distance + (self.horizon_distance - self.nadir_distance) * out
+        r, h = radius + self.altitude, self.altitude
+        ground = -safe_divide(h * (h + 2 * radius) + distance * distance, 2 * r * distance, 1.0)
+        return jnp.concatenate([sky, jnp.clip(ground, -1, self.horizon)])
+
+    def locate(self, mu: Cosine, ground: Bool[Array, "..."], radius: Scalar) -> tuple[Int[Array, "..."], Array]:
+        """First row and four weights for interpolation at ``mu``; the two parts of the table do not mix."""
+        up = jnp.clip(safe_divide(mu - self.horizon, self.highest - self.horizon), 0, 1)
+        distance = geometry.distance_down(self.altitude, mu, jnp.zeros_like(mu), radius)
+        out = safe_divide(distance - self.nadir_distance, self.horizon_distance - self.nadir_distance)
+        above = table.cubic_weights(table.unstretch(up, SKY_LINEAR), self.sky)
+        below = table.cubic_weights(table.unstretch(jnp.clip(out, 0, 1), GROUND_LINEAR), self.ground)
+        return (
+            jnp.where(ground, self.sky + below[0], above[0]),
+            jnp.where(ground[..., None], below[1], above[1]),
+        )
+
+
+def _half_width(mu: Cosine, mu_s: Cosine) -> Cosine:
+    """Half-width of the range of nu tabulated at ``mu``: sinθ sinθ_s, kept from vanishing."""
+    return safe_sqrt((1 - mu * mu) * (1 - mu_s * mu_s) + ZENITH_WIDTH * ZENITH_WIDTH)
+
+
+class MomentsView(View):
+    """Phase-free components on a small grid of directions, interpolated; the phase functions are exact at every pixel.
+
+    Along a row (constant mu) every component is a smooth function of nu, tabulated around mu mu_s, the value at right angles
+    to the sun's plane. nu, unlike azimuth, has a meaning at the zenith.
+    """
+
+    sky: MomentsSky
+    altitude: Scalar
+    sun: Direction
+    rows: _Rows
+    table: Float[Array, "row column cw"]
+    log_transmittance: Float[Array, "row w"]
+
+    @classmethod
+    def build(cls, sky: MomentsSky, altitude: Scalar, sun: Direction) -> "MomentsView":
+        """Integrate along the rays of the grid."""
+        atmosphere, size = sky.atmosphere, sky.resolution
+        radius, top = atmosphere.bottom_radius, atmosphere.top_altitude
+        rows = _Rows.build(atmosphere, altitude, size)
+        mu = rows.mu(radius)
+        ground = jnp.arange(mu.size) >= size.sky_rows
+        x = jnp.asarray(table.chebyshev_nodes(size.columns), mu.dtype)
+        mu_s = sun[2]
+        nu = mu[:, None] * mu_s + _half_width(mu, mu_s)[:, None] * x
+        start, mu_in, mu_s_in, _, misses = geometry.enter_atmosphere(
+            jnp.broadcast_to(altitude, (mu.size, 1)), mu[:, None], mu_s, nu, radius, top
+        )
+        single = scattering.integrate(
+            atmosphere, start, mu_in, mu_s_in, nu, ground[:, None], steps=size.steps, aureole=scattering.AUREOLE_ORDERS
+        )
+        multiple = cls._multiple(sky, start[:, 0], mu_in[:, 0], jnp.broadcast_to(mu_s_in, nu.shape), nu, ground)
+        reach = geometry.distance_down(start, mu_in, jnp.zeros_like(start), radius)
+        mu_s_ground = jnp.clip(((radius + start) * mu_s_in + reach * nu) / radius, -1, 1)
+        below = single.transmittance * sky.ground_radiance(mu_s=mu_s_ground)
+        multiple = multiple + jnp.where(ground[:, None, None], below, 0)
+        components = jnp.stack([multiple, single.rayleigh, single.mie, *single.aureole], axis=-2)
+        components = jnp.where(misses[..., None, None], 0, components)
+        # From Chebyshev nodes to equidistant ones, between which a local cubic is enough.
+        fine = jnp.linspace(-1, 1, size.fine_columns)
+        resample = table.chebyshev(size.columns, fine) @ jnp.asarray(
+            table.chebyshev_coefficients(size.columns), fine.dtype
+        )
+        grid = jnp.einsum("fx,rxc->rfc", resample, components.reshape(*nu.shape, -1))
+        depth = jnp.where(misses[:, :1], 0, jnp.log(jnp.maximum(single.transmittance[:, 0], 1e-30)))
+        return cls(sky, altitude, sun, rows, grid, depth)
+
+    @staticmethod
+    def _multiple(
+        sky: MomentsSky,
+        altitude: Float[Array, " r"],
+        mu: Float[Array, " r"],
+        mu_s: Float[Array, "r x"],
+        nu: Float[Array, "r x"],
+        ground: Bool[Array, " r"],
+    ) -> Float[Array, "r x w"]:
+        """Multiple scattering along the rays of the grid: like ``path``, but nodes do not depend on nu, so that the
+        interpolation in altitude is one matrix product.
+        """  # noqa: D205
+        size, shell = sky.resolution, sky.shell
+        radius, top = sky.atmosphere.bottom_radius, sky.atmosphere.top_altitude
+        i, count, w, j = sky.state.moments.shape
+        nodes = rays.trace(altitude, mu, ground, radius, top, size.steps)
+        at = (altitude[:, None, None], mu[:, None, None])
+        distance = nodes.distance[..., None]
+        mu_here = geometry.mu_along(*at, distance, radius)
+        mu_s_here = geometry.mu_s_along(*at, mu_s[:, None], nu[:, None], distance, radius)
+        altitude_rows = table.cubic_rows(shell.altitude_unit(nodes.altitude), i)
+        there = jnp.einsum("rni,ic->rnc", altitude_rows, sky.state.moments.reshape(i, -1))
+        sun_rows = table.cubic_rows(shell.sun_unit(mu_s_here), j) * dusk(mu_s_here, shell.grazing())[..., None]
+        moments = jnp.einsum("rncj,rnxj->rncx", there.reshape(*nodes.altitude.shape, count * w, j), sun_rows)
+        moments = moments.reshape(*nodes.altitude.shape, count, w, nu.shape[1])
+        angular = basis(
+            size.first_degree,
+            jnp.broadcast_to(mu_here, mu_s_here.shape),
+            mu_s_here,
+            jnp.broadcast_to(nu[:, None], mu_s_here.shape),
+        )
+        weight = sky._source(nodes.altitude) * sky._survival(altitude, mu, nodes, size.steps)[..., None, :]
+        return jnp.einsum("rnlwx,rnlw,rnxl->rxw", moments, weight, angular)
+
+    def _lookup(
+        self, view: Direction
+    ) -> tuple[Float[Array, "... c w"], Int[Array, "..."], Float[Array, "... 4"], Cosine]:
+        radius = self.sky.atmosphere.bottom_radius
+        mu, mu_s, nu = view[..., 2], self.sun[2], view @ self.sun
+        ground = mu < self.rows.horizon
+        row, row_weights = self.rows.locate(mu, ground, radius)
+        x = (nu - mu * mu_s) / _half_width(mu, mu_s)
+        columns = self.table.shape[1]
+        column, column_weights = table.cubic_weights(0.5 * (jnp.clip(x, -1, 1) + 1), columns)
+        patch = jax.vmap(lambda r, c: jax.lax.dynamic_slice(self.table, (r, c, 0), (4, 4, self.table.shape[2])))
+        corners = patch(row.reshape(-1), column.reshape(-1)).reshape(
+            *mu.shape, 4, 4, -1, self.log_transmittance.shape[1]
+        )
+        weights = row_weights[..., :, None] * column_weights[..., None, :]
+        return jnp.einsum("...abcw,...ab->...cw", corners, weights), row, row_weights, nu
+
+    def radiance(self, *, view: Direction) -> Ray:
+        """Radiance (ground included, sun's disc not) and transmittance along unit vectors ``view``, shape (..., 3)."""
+        components, row, row_weights, nu = self._lookup(view)
+        atmosphere = self.sky.atmosphere
+        phases = [
+            jnp.ones_like(nu),
+            phase.rayleigh(nu),
+            phase.mie(nu, atmosphere.mie_g, atmosphere.mie_phase),
+            *self.sky.aureole_phases(nu),
+        ]
+        light = sum(p[..., None] * components[..., c, :] for c, p in enumerate(phases))
+        seen = view[..., 2] <= self.rows.highest
+        depth = sum(row_weights[..., a, None] * self.log_transmittance[row + a] for a in range(4))
+        transmittance_: Transmittance = jnp.exp(jnp.minimum(depth, 0))
+        return Ray(jnp.where(seen[..., None], light, 0), jnp.where(seen[..., None], transmittance_, 1))

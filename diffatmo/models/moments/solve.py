@@ -1,0 +1,179 @@
+"""The moments of all orders of scattering: the first by quadrature, the others by iterating a linear map."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from diffatmo import geometry, phase, table, transmittance
+from diffatmo._types import Altitude, Scalar, Transmittance
+from diffatmo.atmosphere import Atmosphere
+from diffatmo.models.moments.angular import cosines, degrees_of, norms, pairs, polynomials, relative_nu
+from diffatmo.models.moments.shell import Rays, Shell
+from diffatmo.numerics import safe_divide
+
+
+class State(NamedTuple):
+    """Moments M_lm of the radiance, and the irradiance of the ground by the sky, both divided by ``dusk``."""
+
+    moments: Float[Array, "i lm w j"]
+    irradiance: Float[Array, "w j"]
+
+
+def _tail(last: Float[Array, "..."], previous: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Σ_{n>=1} (last / previous)^n, for the orders beyond the last one computed."""
+    ratio = jnp.clip(safe_divide(last, previous), 0, 0.95)
+    return ratio / (1 - ratio)
+
+
+def _project(
+    rays_: Rays, mu_s: Float[Array, " j"], radiance: Float[Array, "i k w p j"], cosine: Float[Array, " p"], degree: int
+) -> Float[Array, "i lm w j"]:
+    """Moments M_lm of a radiance given at all direction nodes and at azimuths with the given cosines."""
+    harmonics = table.chebyshev(degree + 1, cosine) * (2 * jnp.pi / cosine.size)
+    by_order = jnp.einsum("ikwpj,pm->mikwj", radiance, harmonics)
+    by_degree = polynomials(degree, rays_.mu)
+    sine, sine_s = geometry.sine(rays_.mu), geometry.sine(mu_s)
+    weight, scale = rays_.solid_angle, jnp.ones_like(sine_s)
+    by_m = []
+    for m in range(degree + 1):
+        functions = jnp.stack([by_degree[order][m] for order in range(m, degree + 1)], axis=-1) * weight[..., None]
+        by_m.append(jnp.einsum("ikwj,ikl->ilwj", by_order[m], functions) / scale)
+        weight, scale = weight * sine, scale * sine_s
+    squared = norms(degree)
+    return jnp.stack(
+        [float(squared[index]) * by_m[m][:, order - m] for index, (order, m) in enumerate(pairs(degree))], axis=1
+    )
+
+
+def _irradiance(rays_: Rays, radiance: Float[Array, "i k w p j"]) -> Float[Array, "w j"]:
+    """Irradiance of the ground by the sky: the radiance at the lowest node from above its horizon, times mu."""
+    weight = jnp.where(rays_.ground, 0, rays_.solid_angle[0] * rays_.mu[0])
+    return 2 * jnp.pi * jnp.einsum("kwpj,k->wj", radiance[0], weight) / radiance.shape[3]
+
+
+def _leading(spectral: Float[Array, "... w"]) -> Float[Array, "w ..."]:
+    return jnp.moveaxis(spectral, -1, 0)
+
+
+def _first_order(atmosphere: Atmosphere, shell: Shell, degree: int, peak_azimuths: int) -> State:
+    """Moments and ground irradiance, over ``dusk``, of light scattered once or reflected by the ground once."""
+    r = shell.first
+    nodes = r.nodes
+    i, k, n = nodes.altitude.shape
+    p, j = r.azimuths, shell.mu_s.size
+    start = jnp.broadcast_to(shell.altitude[:, None], r.mu.shape)
+    along, end = transmittance.columns_along(atmosphere, start, r.mu, nodes, r.steps)
+    view = jnp.exp(-transmittance.optical_depth(atmosphere, along)) * nodes.weight[..., None]
+    # Two axes, the long one inside, and the wavelength outside: short inner axes would cost the vector units.
+    mu_s_here = r.mu_s_here.reshape(i * k * n, p * j)
+    here = jnp.broadcast_to(nodes.altitude.reshape(-1, 1), mu_s_here.shape)
+    # The barrier keeps the compiler from computing the columns anew for every wavelength.
+    towards_sun, free = jax.lax.optimization_barrier(transmittance.to_top(atmosphere, here, mu_s_here))
+
+    def one_wavelength(air: Scalar, aerosol: Scalar, absorber: Scalar, view: Float[Array, "i k n"]) -> Array:
+        """Phase-free integrals ∫ ρ T ds of air and aerosol."""
+        depth = air * towards_sun.air + aerosol * towards_sun.aerosol + absorber * towards_sun.absorber
+        light = jnp.where(free, jnp.exp(-jnp.where(free, depth, 0)), 0).reshape(i, k, n, p * j)
+        return jnp.einsum("iknt,iknc->ikct", light, view[..., None] * density)
+
+    profiles = (atmosphere.rayleigh_density, atmosphere.mie_density)
+    density = jnp.stack([profile(nodes.altitude) for profile in profiles], axis=-1)
+    smooth = jax.vmap(one_wavelength, out_axes=2)(
+        atmosphere.rayleigh_scattering, atmosphere.mie_extinction, atmosphere.ozone_absorption, _leading(view)
+    ).reshape(i, k, -1, 2, p, j)
+    # In azimuth the integrals are polynomials of low degree; the peak of the phase function needs many more azimuths.
+    dtype = shell.altitude.dtype
+    fine = cosines(peak_azimuths, dtype)
+    to_fine = table.chebyshev(p, fine) @ jnp.asarray(table.chebyshev_coefficients(p), dtype)
+    nu = relative_nu(r.mu[..., None, None], shell.mu_s, fine[:, None])
+    aerosol = phase.mie(nu, atmosphere.mie_g, atmosphere.mie_phase)
+    # Normalised over the very nodes it is summed on: a peak between nodes loses no light.
+    norm = 2 * jnp.pi / fine.size * jnp.einsum("ikpj,ik->ij", aerosol, r.solid_angle)
+    phases = jnp.stack([phase.rayleigh(nu), aerosol / norm[:, None, None, :]])
+    scattering_ = jnp.stack([atmosphere.rayleigh_scattering, atmosphere.mie_scattering], axis=-1)[..., None, None]
+    smooth = jnp.einsum("ikwcpj,fp->ikwcfj", scattering_ * smooth, to_fine)
+    radiance = jnp.sum(smooth * jnp.moveaxis(phases, 0, 2)[:, :, None], axis=3)
+    ground_level = jnp.zeros_like(r.mu_s_ground)
+    sunlit = jnp.maximum(r.mu_s_ground, 0)[..., None] * transmittance.to_sun(atmosphere, ground_level, r.mu_s_ground)
+    sky_count = k - r.mu_s_ground.shape[1]
+    survives = jnp.exp(-transmittance.optical_depth(atmosphere, end))[:, sky_count:, None, None, :]
+    reflected = jnp.einsum("igpjw,fp->igwfj", atmosphere.ground_albedo / jnp.pi * survives * sunlit, to_fine)
+    radiance = radiance.at[:, sky_count:].add(reflected)
+    radiance = radiance * (atmosphere.solar_irradiance[:, None, None] / shell.dusk)
+    return State(_project(r, shell.mu_s, radiance, fine, degree), _irradiance(r, radiance))
+
+
+class _Transport(eqx.Module):
+    """K: from the moments of one order of scattering to those of the next."""
+
+    shell: Shell
+    albedo: Float[Array, " w"]
+    weight: Float[Array, "i k n l w"]
+    """T times (β_R χ^R_l + β_M χ^M_l) times the quadrature weight."""
+    survives: Transmittance
+
+    @classmethod
+    def build(cls, atmosphere: Atmosphere, shell: Shell, degree: int) -> "_Transport":
+        r = shell.higher
+        start = jnp.broadcast_to(shell.altitude[:, None], r.mu.shape)
+        along, end = transmittance.columns_along(atmosphere, start, r.mu, r.nodes, r.steps)
+        view = jnp.exp(-transmittance.optical_depth(atmosphere, along)) * r.nodes.weight[..., None]
+        source = source_moments(atmosphere, r.nodes.altitude, degree)
+        survives = jnp.exp(-transmittance.optical_depth(atmosphere, end))[:, r.mu.shape[1] - r.mu_s_ground.shape[1] :]
+        return cls(shell, atmosphere.ground_albedo, view[..., None, :] * source, survives)
+
+    def apply(self, state: State, degree: int) -> State:
+        """The next order; its moments to ``degree``."""
+        shell, r = self.shell, self.shell.higher
+        i, count, w, j = state.moments.shape
+        k, n, p = *r.nodes.altitude.shape[1:], r.azimuths
+        there = jnp.einsum("iknh,hc->iknc", shell.altitude_rows, state.moments.reshape(i, -1))
+        moments = jnp.einsum("ikncs,iknst->iknct", there.reshape(i, k, n, count * w, j), shell.sun_rows)
+        moments = moments.reshape(i, k, n, count, w, p * j)
+        weight = self.weight[:, :, :, degrees_of(count), :, None]
+        radiance = jnp.sum(moments * shell.angular[:, :, :, :, None] * weight, axis=(2, 3))
+        falling = jnp.einsum("ws,igst->igwt", state.irradiance, shell.ground_rows)
+        reflected = (self.albedo / jnp.pi * self.survives)[..., None] * falling
+        radiance = radiance.at[:, k - reflected.shape[1] :].add(reflected)
+        radiance = radiance.reshape(i, k, w, p, j) / shell.dusk
+        cosine = cosines(p, shell.altitude.dtype)
+        return State(_project(r, shell.mu_s, radiance, cosine, degree), _irradiance(r, radiance))
+
+
+def source_moments(atmosphere: Atmosphere, altitude: Altitude, degree: int) -> Float[Array, "... l w"]:
+    """β_R(h) χ^R_l + β_M(h) χ^M_l, km^-1, for l = 0 … degree."""
+    air = jnp.asarray(phase.rayleigh_moments(degree), altitude.dtype)[:, None] * atmosphere.rayleigh_scattering
+    aerosol = phase.mie_moments(atmosphere.mie_g, degree, atmosphere.mie_phase)[:, None] * atmosphere.mie_scattering
+    densities = atmosphere.rayleigh_density(altitude), atmosphere.mie_density(altitude)
+    return densities[0][..., None, None] * air + densities[1][..., None, None] * aerosol
+
+
+def solve(
+    atmosphere: Atmosphere,
+    shell: Shell,
+    *,
+    orders: int,
+    first_degree: int,
+    iteration_degree: int,
+    higher_degree: int,
+    peak_azimuths: int,
+) -> State:
+    """Moments of all scattered light, and the irradiance of the ground by the sky, both divided by ``dusk``."""
+    first = _first_order(atmosphere, shell, first_degree, peak_azimuths)
+    count = len(pairs(iteration_degree))
+    seed = State(first.moments[:, :count], first.irradiance)
+    transport = _Transport.build(atmosphere, shell, iteration_degree)
+    total, term, previous = seed, seed, seed
+    for _ in range(orders - 1):
+        previous, term = term, transport.apply(term, iteration_degree)
+        total = State(total.moments + term.moments, total.irradiance + term.irradiance)
+    # Geometric tail: far along the series each order is the one before times a ratio, here that of the mean radiance.
+    tail = _tail(term.moments[:, :1], previous.moments[:, :1])
+    ground_tail = _tail(term.irradiance, previous.irradiance)
+    total = State(total.moments + tail * term.moments, total.irradiance + ground_tail * term.irradiance)
+    beyond = transport.apply(total, higher_degree)
+    kept = beyond.moments.shape[1]
+    return State(first.moments.at[:, :kept].add(beyond.moments), first.irradiance + beyond.irradiance)

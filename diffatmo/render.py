@@ -1,0 +1,105 @@
+"""A picture of a sky: camera × model → radiance at every pixel and wavelength."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from diffatmo import geometry
+from diffatmo import sun as sunlight
+from diffatmo._types import Direction, Radiance, Scalar
+from diffatmo.atmosphere import Atmosphere
+from diffatmo.camera import Camera
+from diffatmo.constants import SUN_ANGULAR_RADIUS
+from diffatmo.models import Model, Moments, View
+
+TILE_PIXELS = 2**16
+"""Pixels computed at a time; bounds the memory of a large picture."""
+
+RESOLVED = 20.0
+"""Diameter of the sun in pixels from which its disc is evaluated pixel by pixel."""
+
+
+def _array(value: Any) -> Array:
+    return jnp.asarray(value, dtype=jnp.result_type(float))
+
+
+class Scene(eqx.Module):
+    """All that a picture depends on: air, camera, its altitude (km), the unit vector to the sun, and the exposure.
+
+    Pixels are radiance times ``exposure``.
+    """
+
+    atmosphere: Atmosphere
+    camera: Camera
+    altitude: Scalar = eqx.field(converter=_array)
+    sun: Direction = eqx.field(converter=_array)
+    exposure: Scalar = eqx.field(converter=_array, default=1.0)
+
+
+@eqx.filter_jit
+def render(
+    scene: Scene,
+    model: Model | None = None,
+    *,
+    sun_disc: bool = False,
+    sun_angular_radius: float | Scalar = SUN_ANGULAR_RADIUS,
+) -> Float[Array, "height width w"]:
+    """Radiance times exposure of every pixel, 0 outside a fisheye's circle; ``model`` is :class:`Moments` by default.
+
+    A pixel has the radiance at its centre. The disc of the sun is drawn if asked for: pixel by pixel where it is large,
+    otherwise by spreading the light of many points of the disc over the pixels around them, so that the irradiance of a
+    small sun is right in a picture that does not resolve it.
+    """
+    sky = (model or Moments()).sky(scene.atmosphere)
+    view = sky.view(altitude=scene.altitude, sun=scene.sun)
+    resolved = 2 * sun_angular_radius > RESOLVED * scene.camera.pixel_angle
+
+    def tile(directions: Float[Array, "columns 3"]) -> Float[Array, "columns w"]:
+        ray = view.radiance(view=directions)
+        if not sun_disc:
+            return ray.radiance
+        disc = sunlight.disc_radiance(
+            view=directions,
+            sun=scene.sun,
+            irradiance=scene.atmosphere.solar_irradiance,
+            wavelengths=scene.atmosphere.wavelengths,
+            angular_radius=sun_angular_radius,
+        )
+        return ray.radiance + jnp.where(resolved, disc * _clear(scene, directions, ray.transmittance), 0)
+
+    directions = scene.camera.directions()
+    rows = max(1, TILE_PIXELS // scene.camera.width)
+    whole = rows >= scene.camera.height
+    picture = tile(directions) if whole else jax.lax.map(tile, directions, batch_size=rows)
+    if sun_disc:
+        picture = picture + jnp.where(resolved, 0, _small_sun(scene, view, sun_angular_radius))
+    return jnp.where(scene.camera.valid()[..., None], scene.exposure * picture, 0)
+
+
+def _clear(scene: Scene, directions: Direction, transmittance: Radiance) -> Radiance:
+    """The fraction of sunlight that arrives along ``directions``: none through the ground."""
+    ground = geometry.hits_ground(scene.altitude, directions[..., 2], scene.atmosphere.bottom_radius)
+    return jnp.where(ground[..., None], 0, transmittance)
+
+
+def _small_sun(scene: Scene, view: View, angular_radius: float | Scalar) -> Float[Array, "height width w"]:
+    """Radiance the sun adds to pixels that do not resolve it: each point's light goes to the four pixels around it."""
+    camera, air = scene.camera, scene.atmosphere
+    points, shares = sunlight.disc_points(scene.sun, wavelengths=air.wavelengths, angular_radius=angular_radius)
+    arriving = _clear(scene, points, view.radiance(view=points).transmittance)
+    light = jnp.where(camera.sees(points)[:, None], air.solar_irradiance * shares * arriving, 0)
+    xy = camera.pixels(points)
+    corner = jnp.floor(xy)
+    fraction = xy - corner
+    column, row = corner.astype(jnp.int32).T
+    picture = jnp.zeros((camera.height, camera.width, air.wavelengths.size), light.dtype)
+    for right in (0, 1):
+        for down in (0, 1):
+            x = (column + right) % camera.width if camera.wraps else jnp.clip(column + right, 0, camera.width - 1)
+            y = jnp.clip(row + down, 0, camera.height - 1)
+            share = jnp.prod(jnp.abs(fraction - jnp.array([1 - right, 1 - down])), axis=-1)
+            picture = picture.at[y, x].add(light * share[:, None])
+    return picture / camera.solid_angles()[..., None]

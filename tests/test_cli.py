@@ -1,0 +1,365 @@
+"""The command line: what goes in, what comes out, and the exit status. A model of a few operations keeps it quick."""
+
+import csv
+import json
+import math
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from diffatmo import atmosphere, imageio, models, scene, sun
+from diffatmo.camera import Equirectangular, Fisheye, Pinhole
+from diffatmo.cli import radiance as radiance_command
+from diffatmo.cli import shipped
+from diffatmo.cli.main import main
+from diffatmo.cli.scenefile import FREE
+from diffatmo.models.base import Model, Sky
+from diffatmo.models.base import Path as RayPath
+from diffatmo.render import Scene
+
+ROOT = Path(__file__).parent.parent
+
+
+class Toy(Model):
+    """Light in proportion to the coefficients; nothing like a sky, but quick, smooth and different for every ray."""
+
+    def sky(self, atmosphere):
+        return ToySky(atmosphere)
+
+
+class ToySky(Sky):
+    atmosphere: atmosphere.Atmosphere
+
+    def path(self, *, altitude, mu, mu_s, nu, distance=None):
+        air = self.atmosphere
+        molecules = air.rayleigh_scattering * (1 + nu[..., None] ** 2) * (2 + mu_s[..., None])
+        aerosol = air.mie_scattering * jnp.exp(air.mie_g * nu[..., None]) * (2 - mu[..., None])
+        transmittance = jnp.exp(-air.rayleigh_scattering / (1 + altitude[..., None]))
+        return RayPath(molecules + aerosol, transmittance)
+
+    def sun_irradiance(self, *, altitude, mu_s):
+        return jnp.maximum(mu_s, 0)[..., None] * self.atmosphere.solar_irradiance
+
+    def sky_irradiance(self, *, mu_s):
+        return jnp.zeros((*mu_s.shape, self.atmosphere.wavelengths.size), mu_s.dtype)
+
+
+@pytest.fixture
+def toy(monkeypatch):
+    for name in ("moments", "raymarch"):
+        monkeypatch.setitem(models.MODELS, name, Toy)
+
+
+@pytest.fixture
+def atm(tmp_path, s1):
+    atmosphere.save(s1, tmp_path / "atm.toml")
+    return str(tmp_path / "atm.toml")
+
+
+def write_csv(path, header, rows):
+    with open(path, "w", newline="") as file:
+        csv.writer(file).writerows([header, *rows])
+    return str(path)
+
+
+def read_csv(path):
+    with open(path, newline="") as file:
+        return list(csv.DictReader(file))
+
+
+DIRECTIONS = ["altitude_km", "sun_zenith_deg", "view_zenith_deg", "view_azimuth_deg"]
+
+
+def direct(model, air, row):
+    """Radiance and transmittance of one row, asked of the library."""
+    zenith, view, azimuth = (math.radians(float(row[name])) for name in DIRECTIONS[1:])
+    ray = model.sky(air).radiance(
+        altitude=jnp.asarray(float(row["altitude_km"])),
+        view=sun.direction(zenith=view, azimuth=azimuth),
+        sun=sun.direction(zenith=zenith, azimuth=0.0),
+    )
+    return np.concatenate([ray.radiance, ray.transmittance])
+
+
+def test_radiance_keeps_rows_columns_and_order(tmp_path, atm, s1, toy, monkeypatch):
+    monkeypatch.setattr(radiance_command, "CHUNK", 4)
+    rng = np.random.default_rng(1)
+    header = ["name", "view_azimuth_deg", " sun_zenith_deg", "view_zenith_deg", "altitude_km"]
+    rows = [
+        [f"ray {i}, so", *(f"{x:.3f}" for x in rng.uniform((-180, 0, 0, 0), (360, 96, 180, 20)))] for i in range(11)
+    ]
+    table = write_csv(tmp_path / "in.csv", header, rows)
+    assert main(["radiance", atm, table, "-o", str(tmp_path / "out.csv")]) == 0
+    with open(tmp_path / "out.csv", newline="") as file:
+        written = list(csv.reader(file))
+    added = [f"{quantity}_{nm}" for quantity in ("radiance", "transmittance") for nm in (680, 550, 440)]
+    assert written[0] == [*map(str.strip, header), *added]
+    assert [row[:5] for row in written[1:]] == rows
+    for row in read_csv(tmp_path / "out.csv"):
+        expected = direct(Toy(), s1, row)
+        assert [float(row[name]) for name in added] == pytest.approx(expected, rel=2e-6)
+
+
+def test_radiance_in_double_precision(tmp_path, atm, toy):
+    table = write_csv(tmp_path / "in.csv", DIRECTIONS, [[0.5, 60, 30, 10]])
+    values = {}
+    for name, options in {"single": [], "double": ["--x64"]}.items():
+        assert main(["radiance", atm, table, "-o", str(tmp_path / name), *options]) == 0
+        values[name] = read_csv(tmp_path / name)[0]["radiance_680"]
+    assert len(values["double"]) > len(values["single"]) + 4  # digits
+    assert float(values["double"]) == pytest.approx(float(values["single"]), rel=1e-6)
+    assert jnp.zeros(()).dtype == jnp.float32  # the precision of this process is untouched
+
+
+def test_radiance_names_wavelengths_with_as_few_digits_as_possible():
+    air = atmosphere.earth([680.0, 550.55])
+    assert radiance_command.new_columns(air) == [
+        "radiance_680",
+        "radiance_550.55",
+        "transmittance_680",
+        "transmittance_550.55",
+    ]
+
+
+def test_radiance_as_a_process_agrees_with_the_library(tmp_path, atm, s1):
+    rows = [[0.5, 60, 0, 0], [0.5, 60, 85, 90], [0.5, 60, 150, 180], [2.0, 91, 89.9, 0]]
+    table = write_csv(tmp_path / "in.csv", DIRECTIONS, rows)
+    out = tmp_path / "out.csv"
+    command = [sys.executable, "-m", "diffatmo", "radiance", atm, table, "-o", str(out), "--model", "raymarch"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+    for row in read_csv(out):
+        written = [float(value) for name, value in row.items() if name not in DIRECTIONS]
+        assert written == pytest.approx(direct(models.RayMarch(), s1, row), rel=1e-4)
+
+
+def test_radiance_may_replace_an_empty_file(tmp_path, atm, toy):
+    table = write_csv(tmp_path / "in.csv", DIRECTIONS, [[0.5, 60, 30, 10]])
+    (tmp_path / "out.csv").touch()
+    assert main(["radiance", atm, table, "-o", str(tmp_path / "out.csv")]) == 0
+    assert main(["radiance", atm, table, "-o", str(tmp_path / "out.csv")]) == 2
+    assert main(["radiance", atm, table, "-o", str(tmp_path / "out.csv"), "--overwrite"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        (["--width", "16"], Equirectangular(8, 16)),
+        (["--width", "16", "--upper"], Equirectangular(4, 16, upper=True)),
+        (["--height", "8", "--projection", "fisheye", "--fov-deg", "120"], Fisheye(8, 8, math.radians(120))),
+        (
+            ["--width", "12", "--projection", "pinhole", "--fov-deg", "40", "--yaw-deg", "30", "--pitch-deg", "10"],
+            Pinhole(8, 12, math.radians(40), math.radians(30), math.radians(10)),
+        ),
+    ],
+)
+def test_render_writes_the_scene_it_was_asked_for(tmp_path, toy, options, expected):
+    exr, png = tmp_path / "sky.exr", tmp_path / "sky.png"
+    place = ["--altitude-km", "2", "--sun-zenith-deg", "70", "--sun-azimuth-deg", "20", "--exposure", "3"]
+    assert main(["render", "mars", "-o", str(exr), "-o", str(png), *options, *place]) == 0
+    pixels, shown, notes = scene.load(exr)
+    assert notes == {"model": "moments", "sun_disc": False}
+    assert type(shown.camera) is type(expected)
+    assert np.allclose(shown.camera.directions(), expected.directions(), atol=1e-6)
+    assert float(shown.altitude) == 2.0
+    assert np.allclose(shown.sun, sun.direction(zenith=math.radians(70), azimuth=math.radians(20)))
+    assert atmosphere.dumps(shown.atmosphere) == atmosphere.dumps(atmosphere.mars())
+    sky = Toy().sky(shown.atmosphere)
+    radiance = sky.radiance(altitude=shown.altitude, view=expected.directions(), sun=shown.sun).radiance
+    lit = np.asarray(expected.valid())
+    assert np.allclose(pixels[lit], 3 * np.asarray(radiance)[lit], rtol=1e-5)
+    assert imageio.read_image(png, transfer="srgb").pixels.shape == pixels.shape
+
+
+def toy_image(path, air, *, zenith, noise=0.01, seed=0, height=8, width=32):
+    """An image of the toy sky with its scene in the header."""
+    camera = Equirectangular(height, width, upper=True)
+    towards = sun.direction(zenith=math.radians(zenith), azimuth=0.3)
+    view = camera.directions()
+    pixels = np.asarray(ToySky(air).radiance(altitude=jnp.asarray(0.1), view=view, sun=towards).radiance)
+    pixels = pixels * (1 + noise * np.random.default_rng(seed).standard_normal(pixels.shape))
+    scene.save(path, pixels.astype(np.float32), Scene(air, camera, 0.1, towards), notes={"noise": noise})
+    return str(path)
+
+
+@pytest.fixture
+def start(tmp_path, s1):
+    """The atmosphere of the images with some values 30 % off."""
+    keys = atmosphere.to_dict(s1)
+    keys["rayleigh_scattering_per_km"] = [1.3 * x for x in keys["rayleigh_scattering_per_km"]]
+    keys["mie_g"] = 0.6
+    atmosphere.save(atmosphere.from_dict(keys), tmp_path / "start.toml")
+    return str(tmp_path / "start.toml")
+
+
+TOY_FREE = ["--free", "rayleigh_scattering,mie_g"]
+
+
+def test_fit_of_single_images(tmp_path, s1, start, toy, capfd):
+    images = [toy_image(tmp_path / f"sky_{z}.exr", s1, zenith=z, seed=z) for z in (40, 80)]
+    out = tmp_path / "out"
+    assert main(["fit", *images, "--init", start, *TOY_FREE, "-o", str(out)]) == 0
+    shown, errors = capfd.readouterr()
+    assert errors == ""
+    assert "step" in shown  # progress
+    assert "rayleigh_scattering" in shown  # the table
+    assert f"Report: {out / 'report.html'}" in shown
+    record = json.loads((out / "fit.json").read_text())
+    assert record["converged"]
+    assert record["reduced_chi2"] == pytest.approx(1, abs=0.15)
+    g = record["parameters"]["mie_g"]
+    assert (g["initial"], g["truth"]) == pytest.approx((0.6, 0.8))
+    assert abs(g["value"] - 0.8) < 4 * g["standard_error"]
+    assert len(record["images"]) == 2
+    fitted = atmosphere.load(out / "atmosphere.toml")
+    assert np.allclose(fitted.rayleigh_scattering, s1.rayleigh_scattering, rtol=0.02)
+    assert np.array_equal(fitted.mie_scattering, s1.mie_scattering)
+    assert "<html" in (out / "report.html").read_text()
+
+
+def test_fit_of_a_scene_file(tmp_path, s1, start, toy):
+    """Paths are relative to the file, images without a header are described, and groups share an exposure."""
+    folder = tmp_path / "images"
+    folder.mkdir()
+    Path(start).rename(folder / "start.toml")
+    for z in (40, 80):
+        toy_image(folder / f"with_{z}.exr", s1, zenith=z, seed=z)
+        pixels, _, _ = scene.load(folder / f"with_{z}.exr")
+        imageio.write_exr(folder / f"bare_{z}.exr", 2 * pixels)
+    (folder / "scene.toml").write_text(
+        'init = "start.toml"\nfree = ["rayleigh_scattering", "mie_g"]\nscaled = ["rayleigh_scattering"]\n'
+        + "".join(
+            f'[[image]]\nfile = "bare_{z}.exr"\nprojection = "equirectangular"\naltitude_km = 0.1\n'
+            f"sun_zenith_deg = {z}.0\nsun_azimuth_deg = {math.degrees(0.3)}\n"
+            'exposure = "camera"\nnoise = 0.01\nview_zenith_max_deg = 90.0\nsun_exclusion_deg = 3\n'
+            for z in (40, 80)
+        )
+    )
+    assert main(["fit", "--config", str(folder / "scene.toml"), "-o", str(tmp_path / "out")]) == 0
+    record = json.loads((tmp_path / "out" / "fit.json").read_text())
+    assert list(record["exposures"]) == ["exposure_camera"]
+    ratio = np.divide(record["parameters"]["rayleigh_scattering"]["value"], s1.rayleigh_scattering)
+    assert np.allclose(ratio, ratio[0], rtol=1e-5)
+    assert record["exposures"]["exposure_camera"]["value"] * ratio[0] == pytest.approx(2, rel=0.05)
+    assert record["parameters"]["mie_g"]["truth"] is None
+
+
+def test_options_come_before_the_header(tmp_path, s1, start, toy):
+    image = toy_image(tmp_path / "sky.exr", s1, zenith=40)
+    options = ["--altitude-km", "3", "--sun-zenith-deg", "50", "--noise", "0.5", "--exposure", "free"]
+    assert main(["fit", image, "--init", start, *TOY_FREE, *options, "-o", str(tmp_path / "out")]) == 0
+    (record,) = json.loads((tmp_path / "out" / "fit.json").read_text())["images"]
+    assert record["altitude_km"] == 3
+    assert record["sun_zenith_deg"] == pytest.approx(50, abs=1e-3)
+    assert record["sun_azimuth_deg"] == pytest.approx(math.degrees(0.3), abs=1e-3)  # of the header
+
+
+def test_channels_are_matched_by_wavelength(tmp_path, s1, start, toy):
+    """An image whose channels come in another order than the atmosphere's wavelengths gives the same fit."""
+    image = toy_image(tmp_path / "sky.exr", s1, zenith=40)
+    keys = atmosphere.to_dict(atmosphere.load(start))
+    for name, value in keys.items():
+        if isinstance(value, list):
+            keys[name] = [value[i] for i in (2, 0, 1)]
+    atmosphere.save(atmosphere.from_dict(keys), tmp_path / "turned.toml")
+    assert main(["fit", image, "--init", str(tmp_path / "turned.toml"), *TOY_FREE, "-o", str(tmp_path / "out")]) == 0
+    fitted = atmosphere.load(tmp_path / "out" / "atmosphere.toml")
+    assert np.allclose(fitted.rayleigh_scattering, s1.rayleigh_scattering[jnp.array([2, 0, 1])], rtol=0.03)
+
+
+def test_fit_that_does_not_converge_is_written_all_the_same(tmp_path, s1, start, toy):
+    image = toy_image(tmp_path / "sky.exr", s1, zenith=40)
+    out = tmp_path / "out"
+    assert main(["fit", image, "--init", start, *TOY_FREE, "--max-steps", "1", "-o", str(out)]) == 1
+    assert not json.loads((out / "fit.json").read_text())["converged"]
+    assert (out / "atmosphere.toml").exists()
+    assert (out / "report.html").exists()
+
+
+def test_sun_is_found_in_the_picture(tmp_path, s1, start, toy):
+    camera = Equirectangular(32, 64)
+    towards = sun.direction(zenith=0.9, azimuth=2.0)
+    view = camera.directions()
+    pixels = np.array(ToySky(s1).radiance(altitude=jnp.asarray(0.1), view=view, sun=towards).radiance)
+    x, y = np.round(camera.pixels(towards)).astype(int)
+    pixels[y, x] *= 1000
+    imageio.write_exr(tmp_path / "sky.exr", pixels)
+    described = ["--projection", "equirectangular", "--altitude-km", "0.1", "--sun", "detect"]
+    described += ["--sun-exclusion-deg", "8", "--view-zenith-max-deg", "90"]
+    arguments = ["fit", str(tmp_path / "sky.exr"), "--init", start, *TOY_FREE, *described, "-o", str(tmp_path / "out")]
+    assert main(arguments) == 0
+    (record,) = json.loads((tmp_path / "out" / "fit.json").read_text())["images"]
+    assert record["sun_zenith_deg"] == pytest.approx(math.degrees(0.9), abs=3)
+    assert record["sun_azimuth_deg"] == pytest.approx(math.degrees(2.0), abs=3)
+
+
+def test_mask_leaves_out_black_pixels(tmp_path, s1, start, toy):
+    image = toy_image(tmp_path / "sky.exr", s1, zenith=40, height=8, width=32)
+    mask = np.ones((8, 32, 3))
+    mask[:, :16] = 0
+    imageio.write_png(tmp_path / "mask.png", mask)
+    options = ["--mask", str(tmp_path / "mask.png"), "--sun-exclusion-deg", "0"]
+    assert main(["fit", image, "--init", start, *TOY_FREE, *options, "-o", str(tmp_path / "out")]) == 0
+    (record,) = json.loads((tmp_path / "out" / "fit.json").read_text())["images"]
+    assert sum(record["masked"].values()) == 8 * 16
+
+
+def test_nothing_is_overwritten_unless_asked(tmp_path, s1, start, toy, capsys):
+    image = toy_image(tmp_path / "sky.exr", s1, zenith=40)
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "fit.json").write_text("mine")
+    arguments = ["fit", image, "--init", start, *TOY_FREE, "-o", str(out)]
+    assert main(arguments) == 2
+    assert "fit.json" in capsys.readouterr().err
+    assert (out / "fit.json").read_text() == "mine"
+    assert main([*arguments, "--overwrite"]) == 0
+    assert (out / "fit.json").read_text() != "mine"
+
+
+def test_fit_without_arguments_takes_the_shipped_images(tmp_path, s1, start, toy, monkeypatch):
+    for name in ("clear", "hazy"):
+        folder = tmp_path / "shipped" / name
+        folder.mkdir(parents=True)
+        toy_image(folder / "sky_40.exr", s1, zenith=40)
+        (folder / "scene.toml").write_text(
+            f"init = '{start}'\nfree = ['rayleigh_scattering', 'mie_g']\n[[image]]\nfile = 'sky_40.exr'\n"
+        )
+    monkeypatch.setattr(shipped, "scenes", lambda: sorted((tmp_path / "shipped").glob("*/scene.toml")))
+    assert main(["fit", "-o", str(tmp_path / "out")]) == 0
+    for name in ("clear", "hazy"):
+        assert json.loads((tmp_path / "out" / name / "fit.json").read_text())["converged"]
+
+
+def test_shipped_images_are_found():
+    for path in shipped.scenes():
+        assert path.name == "scene.toml"
+        assert list(path.parent.glob("*.exr"))
+
+
+def test_default_parameters_are_those_of_an_atmosphere():
+    assert set(FREE) <= set(atmosphere.FILE_KEYS)
+
+
+def test_a_fault_of_ours_keeps_its_traceback(tmp_path, atm, monkeypatch):
+    def broken():
+        raise ValueError("a fault")
+
+    monkeypatch.setitem(models.MODELS, "moments", broken)
+    table = write_csv(tmp_path / "in.csv", DIRECTIONS, [[0.5, 60, 30, 10]])
+    with pytest.raises(ValueError, match="a fault"):
+        main(["radiance", atm, table, "-o", str(tmp_path / "out.csv")])
+
+
+def test_help_and_version(capsys):
+    for arguments in ([], ["--help"], ["fit", "-h"], ["radiance", "--help"], ["render", "--help"], ["--version"]):
+        assert main(arguments) == 0
+        shown, errors = capsys.readouterr()
+        assert "diffatmo" in shown
+        assert errors == ""
+    assert jax.config.jax_enable_x64 is False
