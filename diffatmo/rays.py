@@ -147,16 +147,15 @@ def trace(
         pieces.append((jnp.where(ascending, low, between), jnp.where(ascending, between, high), sign))
         pieces.append((jnp.where(ascending, between, low), jnp.where(ascending, high, between), sign))
 
-    altitudes, distances, weights = [], [], []
-    for low, high, sign in pieces:
-        rise = jnp.maximum(low - bottom, 0)
-        v_low = v_bottom + safe_divide(rise, v_bottom + safe_sqrt(v_bottom * v_bottom + rise))
-        position = jnp.where(sign[..., None] > 0, s, 1 - s)
-        h, z, slope = _piece(low, high, v_low, perigee, radius, stretch[..., None], position)
-        altitudes.append(h)
-        distances.append(jnp.maximum(sign[..., None] * z - r_mu[..., None], 0))
-        weights.append(slope * w)
-    return Nodes(*(jnp.concatenate(parts, axis=-1) for parts in (altitudes, distances, weights)))
+    low, high, sign = (jnp.stack(parts, axis=-1) for parts in zip(*pieces, strict=True))
+    v_bottom, bottom = v_bottom[..., None], bottom[..., None]
+    rise = jnp.maximum(low - bottom, 0)
+    v_low = v_bottom + safe_divide(rise, v_bottom + safe_sqrt(v_bottom * v_bottom + rise))
+    position = jnp.where(sign[..., None] > 0, s, 1 - s)
+    h, z, slope = _piece(low, high, v_low, perigee[..., None], radius, stretch[..., None, None], position)
+    distance = jnp.maximum(sign[..., None] * z - r_mu[..., None, None], 0)
+    flat = (*mu.shape, len(pieces) * steps)
+    return Nodes(h.reshape(flat), distance.reshape(flat), (slope * w).reshape(flat))
 
 
 def straight(altitude: Altitude, mu: Cosine, length: Length, radius: Scalar, steps: int) -> Nodes:

@@ -257,7 +257,7 @@ def _check_finite(start: Linearisation, batch: Batch, names: Sequence[str]) -> N
         bad = used & ~np.isfinite(np.asarray(values)).all(axis=tuple(range(2, values.ndim)))
         for name, count in zip(names, bad.sum(axis=1), strict=True):
             if count:
-                raise FitError(f"{name}: the model's {what} at the start values are not finite in {count} pixels")
+                raise FitError(f"{name}: the model's {what} at the start: not finite in {count} of the pixels used")
 
 
 def _weigh(problem: Problem, expected: Array) -> Problem:

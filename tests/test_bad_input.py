@@ -67,7 +67,7 @@ def files(tmp_path_factory):
     seen = Scene(air, camera, 0.1, sun.direction(zenith=0.7, azimuth=0.0))
     scene.save(folder / "good.exr", sky(), seen)
     whole = (folder / "good.exr").read_bytes()
-    (folder / "cut.exr").write_bytes(whole[: len(whole) // 2])
+    (folder / "cut.exr").write_bytes(whole[:-100])
     (folder / "stub.exr").write_bytes(whole[:60])
     (folder / "empty.exr").touch()
     (folder / "text.exr").write_text("not an image")

@@ -306,7 +306,7 @@ def test_mask_leaves_out_black_pixels(tmp_path, s1, start, toy):
     options = ["--mask", str(tmp_path / "mask.png"), "--sun-exclusion-deg", "0"]
     assert main(["fit", image, "--init", start, *TOY_FREE, *options, "-o", str(tmp_path / "out")]) == 0
     (record,) = json.loads((tmp_path / "out" / "fit.json").read_text())["images"]
-    assert sum(record["masked"].values()) == 8 * 16
+    assert sum(record["pixels_masked"].values()) == 8 * 16
 
 
 def test_nothing_is_overwritten_unless_asked(tmp_path, s1, start, toy, capsys):

@@ -62,7 +62,7 @@ def test_start_is_the_initial_atmosphere(free):
 
 
 def test_zero_and_boundary_starts():
-    zeros = {name: 0.0 for name in ("rayleigh_scattering", "mie_scattering", "mie_absorption", "ozone_absorption")}
+    zeros = dict.fromkeys(("rayleigh_scattering", "mie_scattering", "mie_absorption", "ozone_absorption"), 0.0)
     init = toy_sky.change(toy_sky.truth(), **zeros, ground_albedo=1.0)
     parameters = select(init, [*zeros, "ground_albedo"])
     assert np.all(np.isfinite(parameters.start))
@@ -87,9 +87,7 @@ def test_scaled_fields_keep_their_ratios():
 
 
 def test_colours_share_a_tangent_among_wavelengths():
-    parameters = select(
-        toy_sky.truth(), ["rayleigh_scattering", "mie_g", "mie_scattering"], scaled=["mie_scattering"]
-    )
+    parameters = select(toy_sky.truth(), ["rayleigh_scattering", "mie_g", "mie_scattering"], scaled=["mie_scattering"])
     colour, channel = parameters.colours()
     assert colour.tolist() == [0, 0, 0, 1, 2]
     assert channel.tolist() == [0, 1, 2, -1, -1]
@@ -110,9 +108,7 @@ def test_derived_quantities():
     atmosphere = toy_sky.truth()
     assert derived_fields(["mie_g", "ground_albedo"]) == []
     assert derived_fields(["mie_scattering"]) == ["mie_optical_depth", "mie_single_scattering_albedo"]
-    depth, albedo = (
-        numbers(atmosphere, [name]) for name in ("mie_optical_depth", "mie_single_scattering_albedo")
-    )
+    depth, albedo = (numbers(atmosphere, [name]) for name in ("mie_optical_depth", "mie_single_scattering_albedo"))
     np.testing.assert_allclose(depth, (3.996e-3 + 0.444e-3) * 1.2, rtol=1e-6)
     np.testing.assert_allclose(albedo, 0.9, rtol=1e-6)
     # Without aerosol there is nothing to take a ratio of.

@@ -122,29 +122,33 @@ def test_sun_of_another_planet(s1):
 # --- Derivatives
 
 
-def derivatives(shot_of, at, step, model, **options):
-    """Forward, reverse and central-difference Jacobians of a picture in a vector of parameters."""
-    picture = eqx.filter_jit(lambda parameters: render.render(shot_of(parameters), model, **options).ravel())
-    numeric = np.stack([(picture(at + d) - picture(at - d)) / (2 * step) for d in step * np.eye(at.size)], -1)
-    return eqx.filter_jit(jax.jacfwd(picture))(at), eqx.filter_jit(jax.jacrev(picture))(at), numeric
+def check(shot_of, at, air, model, step=1e-5, **options):
+    """Forward and reverse derivatives of a picture against central differences.
 
+    ``shot_of(parameters, air)`` is the scene; the atmosphere is an argument, because what a compiled function closes over
+    is folded into constants, for minutes.
+    """
 
-def check(shot_of, at, model, step=1e-5, **options):
-    forward, reverse, numeric = derivatives(shot_of, jnp.asarray(at), step, model, **options)
-    # Relative to the largest entry of each parameter's column, some of which are zero by symmetry.
+    def picture(parameters, air):
+        return render.render(shot_of(parameters, air), model, **options).ravel()
+
+    at, values = jnp.asarray(at), eqx.filter_jit(picture)
+    numeric = np.stack([(values(at + d, air) - values(at - d, air)) / (2 * step) for d in step * np.eye(at.size)], -1)
+    # Relative to the largest entry of each parameter's column; some columns are zero by symmetry.
     scale = np.abs(numeric).max(0)
-    assert (scale > 0).all()
-    np.testing.assert_allclose(forward / scale, numeric / scale, atol=1e-5)
-    np.testing.assert_allclose(reverse / scale, numeric / scale, atol=1e-5)
+    scale = np.maximum(scale, 1e-3 * scale.max())
+    for jacobian in (jax.jacfwd, jax.jacrev):
+        exact = eqx.filter_jit(jacobian(picture))(at, air)
+        np.testing.assert_allclose(exact / scale, numeric / scale, atol=1e-5)
 
 
-def posed(air, kind):
+def posed(kind):
     """(yaw, pitch, roll, fov, sun x, y, z, altitude) -> scene; the sun is turned, not stretched."""
 
-    def build(p):
+    def build(p, air):
         lens = kind(4, 5, yaw=p[0], pitch=p[1], roll=p[2], **({} if kind is Equirectangular else {FOV[kind]: p[3]}))
         towards = p[4:7] / jnp.linalg.norm(p[4:7])
-        return Scene(air, lens, altitude=p[7], sun=towards, exposure=1.0 if kind is not Equirectangular else p[3])
+        return Scene(air, lens, altitude=p[7], sun=towards, exposure=p[3])
 
     return build
 
@@ -156,12 +160,12 @@ SUNS = {"ordinary": (0.3, 0.5, 0.7), "zenith": (0.0, 0.0, 1.0), "horizon": (0.6,
 @pytest.mark.parametrize("kind", [Equirectangular, Fisheye, Pinhole])
 def test_picture_differentiates_in_pose_lens_sun_and_altitude(x64, s1, kind):
     for towards in SUNS.values():
-        check(posed(s1, kind), [0.3, 0.6, 0.2, 0.8, *towards, 0.5], Haze())
+        check(posed(kind), [0.3, 0.6, 0.2, 0.8, *towards, 0.5], s1, Haze())
 
 
 def test_ray_march_differentiates_in_pose_sun_and_altitude(x64, s1):
     for towards in SUNS.values():
-        check(posed(s1, Pinhole), [0.3, 0.9, 0.2, 0.8, *towards, 0.5], RayMarch(steps=4))
+        check(posed(Pinhole), [0.3, 0.9, 0.2, 0.8, *towards, 0.5], s1, RayMarch(steps=4))
 
 
 def test_drawn_sun_differentiates(x64, s1):
@@ -169,10 +173,10 @@ def test_drawn_sun_differentiates(x64, s1):
     lens = Pinhole(4, 5, pitch=0.7)
     towards = lens.directions_at(jnp.array(2.3), jnp.array(1.4))
 
-    def build(p):
-        return Scene(s1, lens, altitude=0.5, sun=p / jnp.linalg.norm(p))
+    def build(p, air):
+        return Scene(air, lens, altitude=0.5, sun=p / jnp.linalg.norm(p))
 
-    check(build, towards, Haze(), step=1e-6, sun_disc=True)
+    check(build, towards, s1, Haze(), step=1e-6, sun_disc=True)
 
 
 def test_gradients_are_finite_at_special_points(s1):
@@ -233,7 +237,7 @@ def test_header_is_readable(s1):
         (("altitude_km = 0.5", 'altitude_km = "high"'), "altitude_km: got 'high', expected a number"),
         (("version = 1", "version = 9"), "version: got 9, expected 1"),
         (("version = 1", "version = "), "not TOML"),
-        (("mie_g = 0.8", "mie_g = 1.8"), "mie_g: got 1.8"),
+        (("mie_g = 0.8", "mie_g = 1.5"), "mie_g: got 1.5"),
         (('"pinhole"', '"cube"'), "projection: got 'cube'"),
         (("height = 4", "height = 5"), "but its header says"),
     ],

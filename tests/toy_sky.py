@@ -3,11 +3,12 @@
 import functools
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 import fitting
-from diffatmo import phase, sun
+from diffatmo import phase
 from diffatmo.atmosphere import Atmosphere
 from diffatmo.camera import Equirectangular
 from diffatmo.models.base import Model, Ray, Sky
@@ -54,6 +55,7 @@ class Toy(Model):
 
 
 CAMERA = Equirectangular(16, 64, upper=True)
+DIRECTIONS = np.asarray(CAMERA.directions())
 
 
 def truth() -> Atmosphere:
@@ -86,22 +88,37 @@ def start(factor: float = 1.3, g: float = 0.6) -> Atmosphere:
     return change(own, mie_g=g, **{name: factor * getattr(own, name) for name in FREE if name != "mie_g"})
 
 
-def image(atmosphere: Atmosphere, zenith: float, altitude: float = 0.1, camera=CAMERA) -> np.ndarray:
-    towards = sun.direction(zenith=np.radians(zenith), azimuth=0.0)
-    view = ToySky(atmosphere).view(altitude=altitude, sun=towards)
-    return np.asarray(view.radiance(view=camera.directions()).radiance)
+@jax.jit
+def _image(atmosphere, towards, directions):
+    return ToySky(atmosphere).view(altitude=0.1, sun=towards).radiance(view=directions).radiance
 
 
-def observations(seed=0, noise=0.01, zeniths=(30.0, 60.0, 80.0), atmosphere=None, exposures=(1, 1, 1), **options):
-    """Images of the truth under several suns, with relative noise."""
+def towards_sun(zenith: float) -> np.ndarray:
+    return np.array([0.0, np.sin(np.radians(zenith)), np.cos(np.radians(zenith))])
+
+
+def image(atmosphere: Atmosphere, zenith: float) -> np.ndarray:
+    return np.asarray(_image(atmosphere, towards_sun(zenith), DIRECTIONS))
+
+
+def observations(
+    seed=0,
+    noise=0.01,
+    stated=None,
+    zeniths=(30.0, 60.0, 80.0),
+    atmosphere=None,
+    factors=(1, 1, 1),
+    exposure=("fixed",) * 3,
+    **options,
+):
+    """Images of the truth under several suns, times `factors`, with relative noise (and that which is `stated`)."""
     random = np.random.default_rng(seed)
     result = []
-    for zenith, factor in zip(zeniths, exposures, strict=False):
+    for zenith, factor, group in zip(zeniths, factors, exposure, strict=False):
         pixels = factor * image(truth() if atmosphere is None else atmosphere, zenith)
         noisy = pixels * (1 + noise * random.standard_normal(pixels.shape))
-        towards = sun.direction(zenith=np.radians(zenith), azimuth=0.0)
-        settings = {"noise": noise or 0.01, "name": f"sun {zenith:g}"} | options
-        result.append(fitting.observe(noisy, camera=CAMERA, altitude=0.1, sun=towards, **settings))
+        settings = {"noise": stated or noise or 0.01, "name": f"sun {zenith:g}", "exposure": group} | options
+        result.append(fitting.observe(noisy, camera=CAMERA, altitude=0.1, sun=towards_sun(zenith), **settings))
     return result
 
 

@@ -2,11 +2,12 @@
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from diffatmo.cli.common import InputError
-from diffatmo.cli.keys import CAMERA_KEYS, make_camera
+from diffatmo.cli.keys import CAMERA_KEYS, flag_of, make_camera
 from diffatmo.cli.scenefile import ImageSpec
 
 if TYPE_CHECKING:
@@ -58,7 +59,7 @@ def observe(spec: ImageSpec, name: str, init: "Atmosphere") -> "tuple[Observatio
         )
     except ValueError as error:
         raise InputError(f"{spec.file}: {str(error).removeprefix(f'{name}: ')}") from error
-    return observation, shot.scene.atmosphere if shot else None
+    return observation, truth_of(shot, init) if shot else None
 
 
 def in_order(image: "Image", init: "Atmosphere") -> "np.ndarray":
@@ -68,20 +69,37 @@ def in_order(image: "Image", init: "Atmosphere") -> "np.ndarray":
     wanted = np.asarray(init.wavelengths, dtype=float)
     count = image.pixels.shape[-1]
     if count != wanted.size:
-        raise InputError(
-            f"{count} channels, but the atmosphere of the fit has {wanted.size} wavelengths ({_list(wanted)})"
-        )
+        channels = "1 channel" if count == 1 else f"{count} channels"
+        raise InputError(f"{channels}, but the atmosphere of the fit has {wanted.size} wavelengths ({_list(wanted)})")
     if image.wavelengths is not None:
         own = np.asarray(image.wavelengths, dtype=float)
-        order = np.argsort(own)[np.argsort(np.argsort(wanted))]
+        order = matching(own, wanted)
         if np.any(np.abs(own[order] - wanted) > SAME_WAVELENGTH_NM):
             raise InputError(f"wavelengths {_list(own)}, but the atmosphere of the fit has {_list(wanted)}")
     elif count == 3:
         # Red, green, blue: the longest wavelength first.
-        order = np.argsort(np.argsort(-wanted))
+        order = matching(np.array([3, 2, 1]), wanted)
     else:
         order = np.arange(count)
     return image.pixels[..., order]
+
+
+def matching(own: "np.ndarray", wanted: "np.ndarray") -> "np.ndarray":
+    """The indices that put numbers ranked like ``own`` into the ranks of ``wanted``."""
+    import numpy as np
+
+    return np.argsort(own)[np.argsort(np.argsort(wanted))]
+
+
+def truth_of(shot: "Shot", init: "Atmosphere") -> "Atmosphere":
+    """The atmosphere that a picture carries, in the order of the wavelengths of ``init``."""
+    import numpy as np
+
+    from diffatmo.atmosphere import SPECTRAL
+
+    truth = shot.scene.atmosphere
+    order = matching(np.asarray(truth.wavelengths), np.asarray(init.wavelengths))
+    return replace(truth, **{name: getattr(truth, name)[order] for name in SPECTRAL})
 
 
 def find_camera(options: Mapping[str, Any], pixels: "np.ndarray", shot: "Shot | None") -> "Camera":
@@ -146,7 +164,7 @@ def read_mask(path: Path) -> "np.ndarray":
 
 
 def _unknown(key: str) -> InputError:
-    return InputError(f"{key} is not known: the image does not carry it, so it has to be given")
+    return InputError(f"{key} is not in the image's header: give {flag_of(key)}, or {key} in a scene file")
 
 
 def _list(wavelengths: "np.ndarray") -> str:

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Number:
-    """A key whose value is a number from ``lowest`` to ``highest``, above ``lowest`` where ``positive``."""
+    """A key whose value is a number from ``lowest`` to ``highest``; with ``positive``, ``lowest`` is 0 and left out."""
 
     help: str
     lowest: float = -math.inf
@@ -27,8 +27,9 @@ class Number:
         """The accepted values in words."""
         if math.isinf(self.lowest):
             return "a number"
-        lowest = f"a number above {self.lowest:g}" if self.positive else f"a number of at least {self.lowest:g}"
-        return lowest if math.isinf(self.highest) else f"{lowest} and at most {self.highest:g}"
+        if math.isinf(self.highest):
+            return f"a number {'above' if self.positive else 'of at least'} {self.lowest:g}"
+        return f"a number from {self.lowest:g} to {self.highest:g}" + ", not 0" * self.positive
 
     def read(self, value: Any) -> float:
         """The value, or :class:`ValueError`."""

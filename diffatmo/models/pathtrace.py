@@ -14,7 +14,35 @@ from diffatmo.models.base import Model, Path, Ray, Sky
 from diffatmo.numerics import safe_divide, safe_sqrt
 
 PANELS = 12
-_LATTICE = np.array([1, 7319, 12989, 9145, 6835, 3019, 16245, 10769, 13605, 14093, 4279, 753, 7361, 12065, 14255, 1683, 223, 9875, 9429, 2697, 8415, 15147, 10321, 9145], np.uint32)
+_LATTICE = np.array(
+    [
+        1,
+        7319,
+        12989,
+        9145,
+        6835,
+        3019,
+        16245,
+        10769,
+        13605,
+        14093,
+        4279,
+        753,
+        7361,
+        12065,
+        14255,
+        1683,
+        223,
+        9875,
+        9429,
+        2697,
+        8415,
+        15147,
+        10321,
+        9145,
+    ],
+    np.uint32,
+)
 FLOOR = 0.02
 ALPHA = 0.5
 BETA = 0.75
@@ -175,8 +203,19 @@ def _build_guide(atm, iters=10):
     ground = geometry.hits_ground(hh, mu, R)
     s = _segment(atm, hh, mu, ground)
     cols, _, (tm, hm, dsca, tau) = _walk(
-        atm, s, 0.5, s.length,
-        lambda c, t0, t1, h1, n1, c0, c1: (c, (0.5 * (t0 + t1), geometry.altitude_along(hh, mu, 0.5 * (t0 + t1), R), _tau(sca, (c1[0] - c0[0], c1[1] - c0[1])), 0.5 * (_tau(ext, c0) + _tau(ext, c1)))),
+        atm,
+        s,
+        0.5,
+        s.length,
+        lambda c, t0, t1, h1, n1, c0, c1: (
+            c,
+            (
+                0.5 * (t0 + t1),
+                geometry.altitude_along(hh, mu, 0.5 * (t0 + t1), R),
+                _tau(sca, (c1[0] - c0[0], c1[1] - c0[1])),
+                0.5 * (_tau(ext, c0) + _tau(ext, c1)),
+            ),
+        ),
         None,
     )
     w_m = jnp.moveaxis(dsca * jnp.exp(-tau), 1, 0)  # w,M,NH,nd
@@ -347,7 +386,12 @@ def _balance(atm, guide, start, with_ground, hemisphere):
     """c [w,P]: one over expected radiance"""
     R, top = atm.bottom_radius, atm.top_altitude
     w = len(atm.wavelengths)
-    h, mu, mu_s, nu = start.altitude, _dot(start.up, start.direction), _dot(start.up, start.sun), _dot(start.direction, start.sun)
+    h, mu, mu_s, nu = (
+        start.altitude,
+        _dot(start.up, start.direction),
+        _dot(start.up, start.sun),
+        _dot(start.direction, start.sun),
+    )
     if hemisphere:
         cell = _cell(h, mu_s, top)
         return jnp.stack([1 / jnp.maximum(guide.diffuse[cell + k * NH * NS], 1e-30) for k in range(w)])
@@ -359,7 +403,12 @@ def _balance(atm, guide, start, with_ground, hemisphere):
     def one(k):
         pick = (jnp.arange(w) == k).astype(h.dtype)
         cols, (t0, t1, _, a, b) = _march(atm, guide, seg, mu_s, nu, pick, jnp.full_like(h, 0.5), end)
-        T = jnp.exp(-sum(x * y for x, y in zip((atm.rayleigh_scattering[k], atm.mie_extinction[k], atm.ozone_absorption[k]), cols)))
+        T = jnp.exp(
+            -sum(
+                x * y
+                for x, y in zip((atm.rayleigh_scattering[k], atm.mie_extinction[k], atm.ozone_absorption[k]), cols)
+            )
+        )
         sees = ground & (start.cap >= seg.length) & with_ground
         return jnp.sum(0.5 * (t1 - t0) * (a + b), axis=0) + jnp.where(sees, T * guide.ground[gi + k * NS], 0)
 
@@ -394,7 +443,12 @@ def _estimate(atm, guide, start, n, stride, log2n, with_ground, hemisphere, rho)
         d0 = start.direction
         if hemisphere:
             base = base + np.uint32(2)
-            d0 = _turn(start.up, start.sun, jnp.sqrt(uni(index, jnp.zeros_like(index))), 2 * jnp.pi * uni(index, jnp.ones_like(index)))
+            d0 = _turn(
+                start.up,
+                start.sun,
+                jnp.sqrt(uni(index, jnp.zeros_like(index))),
+                2 * jnp.pi * uni(index, jnp.ones_like(index)),
+            )
         d = _select(first, d0, d)
         f = jnp.where(first, 1, f)
         mu, mu_s, nu = (jnp.clip(q, -1, 1) for q in (_dot(u, d), _dot(u, start.sun), _dot(d, start.sun)))
@@ -444,7 +498,9 @@ def _estimate(atm, guide, start, n, stride, log2n, with_ground, hemisphere, rho)
         u2 = _normalise(_add((r, u), (ts, d)))
         mus2 = jnp.clip(_dot(u2, start.sun), -1, 1)
         bR, bM = sca[0][:, None] * n_here[0], sca[1][:, None] * n_here[1]
-        weight = jnp.where(alive, f * Tt * safe_divide(jnp.where(on_ground, mass, 1), jnp.where(on_ground, g_ground, pdf)) / q, 0)
+        weight = jnp.where(
+            alive, f * Tt * safe_divide(jnp.where(on_ground, mass, 1), jnp.where(on_ground, g_ground, pdf)) / q, 0
+        )
         Ts = _sun_transmittance(atm, h2, mus2, rnd(2)) * solar
         nee = weight * jnp.where(on_ground, albedo / jnp.pi * jnp.maximum(mus2, 0), bR * PR + bM * PM) * Ts
         total = total + nee
@@ -469,13 +525,20 @@ def _estimate(atm, guide, start, n, stride, log2n, with_ground, hemisphere, rho)
         e_u, _ = _frame(u2, start.sun)
         cosphi = safe_divide(_dot(d2, e_u), safe_sqrt(1 - mu2 * mu2))
         pg = _guide_pdf(guide, cell2, hor2, mu2, cosphi)
-        qR, qH, qM = phase.rayleigh(cos), phase.henyey_greenstein(cos, atm.mie_g), phase.mie(cos, atm.mie_g, atm.mie_phase)
+        qR, qH, qM = (
+            phase.rayleigh(cos),
+            phase.henyey_greenstein(cos, atm.mie_g),
+            phase.mie(cos, atm.mie_g, atm.mie_phase),
+        )
         pdir = (1 - pM - pG) * qR + pM * qH + pG * pg
         f2 = weight * jnp.where(on_ground, albedo, (bR * qR + bM * qM) / pdir)
         alive = alive & (jnp.max(f2, axis=0) > 0)
         running = index < n
         return (
-            h2, u2, d2, f2,
+            h2,
+            u2,
+            d2,
+            f2,
             jnp.where(alive, vertex + 1, 0),
             jnp.where(alive | ~running, index, index + np.uint32(stride)),
             jnp.where(running, total, state[6]),
@@ -483,6 +546,15 @@ def _estimate(atm, guide, start, n, stride, log2n, with_ground, hemisphere, rho)
         )
 
     z = jnp.zeros((w, P), dtype)
-    state = (start.altitude, start.up, start.direction, z + 1, jnp.zeros(P, jnp.int32), start.index, z, jnp.zeros((), jnp.int32))
+    state = (
+        start.altitude,
+        start.up,
+        start.direction,
+        z + 1,
+        jnp.zeros(P, jnp.int32),
+        start.index,
+        z,
+        jnp.zeros((), jnp.int32),
+    )
     out = jax.lax.while_loop(lambda s: jnp.any(s[5] < n), body, state)
     return out[6], out[7]

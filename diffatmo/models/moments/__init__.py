@@ -36,17 +36,15 @@ class Moments(Model):
 
     altitudes: int = 14
     suns: int = 26
-    first: Directions = Directions(sky=14, ground=6, azimuths=6, steps=6)
-    higher: Directions = Directions(sky=8, ground=5, azimuths=6, steps=4)
+    first: Directions = Directions(sky=14, ground=6, azimuths=6, steps=6, degree=8)
+    higher: Directions = Directions(sky=8, ground=5, azimuths=6, steps=4, degree=5)
     peak_azimuths: int = 32
     orders: int = 5
-    first_degree: int = 8
-    higher_degree: int = 5
     iteration_degree: int = 2
     view_steps: int = 8
-    view_sky: int = 32
+    view_sky: int = 48
     view_ground: int = 20
-    view_columns: int = 12
+    view_columns: int = 16
     view_fine_columns: int = 32
 
     def shell(self, *, bottom_radius: Scalar, top_altitude: Scalar) -> Shell:
@@ -68,15 +66,15 @@ class Moments(Model):
         state = solve(
             atmosphere,
             shell,
-            orders=self.orders,
-            first_degree=self.first_degree,
+            orders_=self.orders,
+            first_degree=self.first.degree,
             iteration_degree=self.iteration_degree,
-            higher_degree=self.higher_degree,
+            higher_degree=self.higher.degree,
             peak_azimuths=self.peak_azimuths,
         )
         resolution = Resolution(
-            self.first_degree,
-            self.higher_degree,
+            self.first.degree,
+            self.higher.degree,
             self.view_steps,
             self.view_sky,
             self.view_ground,

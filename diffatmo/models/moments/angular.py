@@ -17,6 +17,16 @@ def pairs(degree: int) -> tuple[tuple[int, int], ...]:
     return tuple((order, m) for order in range(degree + 1) for m in range(order + 1))
 
 
+def degrees(degree: int) -> np.ndarray:
+    """l of every pair."""
+    return np.array([order for order, _ in pairs(degree)])
+
+
+def orders(degree: int) -> np.ndarray:
+    """m of every pair."""
+    return np.array([m for _, m in pairs(degree)])
+
+
 @lru_cache
 def norms(degree: int) -> np.ndarray:
     """Squared norms N_lm of the real spherical harmonics."""
@@ -28,39 +38,39 @@ def norms(degree: int) -> np.ndarray:
     )
 
 
-def polynomials(degree: int, mu: Cosine) -> list[list[Float[Array, "..."]]]:
-    """Π_lm(mu) = d^m P_l / dmu^m as ``result[l][m]``, by the usual upward recurrence in l."""
-    result: list[list[Float[Array, "..."]]] = [[] for _ in range(degree + 1)]
-    for m in range(degree + 1):
-        diagonal = jnp.full_like(mu, float(np.prod(np.arange(2 * m - 1, 0, -2))))
-        result[m].append(diagonal)
-        previous, current = jnp.zeros_like(mu), diagonal
-        for order in range(m + 1, degree + 1):
-            following = ((2 * order - 1) * mu * current - (order + m - 1) * previous) / (order - m)
-            previous, current = current, following
-            result[order].append(current)
-    return result
+@lru_cache
+def _expansion(degree: int) -> np.ndarray:
+    """Coefficients of every Π_lm = d^m P_l / dmu^m in T_0 … T_degree, in which they are well conditioned."""
+    matrix = np.zeros((degree + 1, len(pairs(degree))))
+    for column, (order, m) in enumerate(pairs(degree)):
+        derivative = np.polynomial.legendre.legder(np.eye(order + 1)[order], m)
+        chebyshev = np.polynomial.chebyshev.poly2cheb(np.polynomial.legendre.leg2poly(derivative))
+        matrix[: chebyshev.size, column] = chebyshev
+    return matrix
 
 
-def basis(degree: int, mu: Cosine, mu_s: Cosine, nu: Cosine) -> Float[Array, "... lm"]:
-    """Π_lm(mu) C_m(w, q) for all (l, m): the angular functions of the source."""
+def polar(degree: int, mu: Cosine) -> Float[Array, "... lm"]:
+    """Π_lm(mu) for all (l, m)."""
+    return table.chebyshev(degree + 1, mu) @ jnp.asarray(_expansion(degree), mu.dtype)
+
+
+def azimuthal(degree: int, mu: Cosine, mu_s: Cosine, nu: Cosine) -> Float[Array, "... lm"]:
+    """C_m(w, q) = (sinθ sinθ_s)^m cos(m φ) for the m of every (l, m)."""
     w = nu - mu * mu_s
     q = (1 - mu * mu) * (1 - mu_s * mu_s)
     multiple = [jnp.ones_like(w), w]
     for _ in range(2, degree + 1):
         multiple.append(2 * w * multiple[-1] - q * multiple[-2])
-    by_degree = polynomials(degree, mu)
-    return jnp.stack([by_degree[order][m] * multiple[m] for order, m in pairs(degree)], axis=-1)
+    return jnp.stack(multiple[: degree + 1], axis=-1)[..., orders(degree)]
 
 
-def degrees(degree: int) -> np.ndarray:
-    return np.array([order for order, _ in pairs(degree)])
-
-
-def degrees_of(count: int) -> np.ndarray:
-    """Degree l of each of the first ``count`` (l, m) pairs."""
-    degree = next(d for d in range(count + 1) if len(pairs(d)) == count)
-    return degrees(degree)
+def projection(degree: int, mu: Cosine) -> Float[Array, "... lm"]:
+    """N_lm Π_lm(mu) sin^m θ for all (l, m): what a radiance is multiplied by to find its moments."""
+    powers = [jnp.ones_like(mu)]
+    for _ in range(degree):
+        powers.append(powers[-1] * geometry.sine(mu))
+    sines = jnp.stack(powers, axis=-1)[..., orders(degree)]
+    return jnp.asarray(norms(degree), mu.dtype) * polar(degree, mu) * sines
 
 
 def cosines(azimuths: int, dtype: jnp.dtype) -> Float[Array, " p"]:

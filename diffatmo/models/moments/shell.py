@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool, Float
 
 from diffatmo import geometry, rays, table
 from diffatmo._types import Altitude, Cosine, Scalar
-from diffatmo.models.moments.angular import basis, cosines, relative_nu
+from diffatmo.models.moments.angular import azimuthal, cosines, orders, polar, projection, relative_nu
 from diffatmo.numerics import gauss_legendre, safe_divide, safe_sqrt
 
 ALTITUDE_LINEAR = 0.04
@@ -28,6 +28,8 @@ class Directions(NamedTuple):
     ground: int
     azimuths: int
     steps: int
+    degree: int
+    """Degree of the moments that are wanted."""
 
 
 class Rays(eqx.Module):
@@ -40,6 +42,10 @@ class Rays(eqx.Module):
     mu: Float[Array, "i k"]
     solid_angle: Float[Array, "i k"]
     """Weight of the direction: d mu, so that a sum over k and a mean over azimuth times 2π integrates the sphere."""
+    project: Float[Array, "i k lm"]
+    """Solid angle times N_lm Π_lm sin^m θ."""
+    sun_scale: Float[Array, "lm j"]
+    """sin^-m θ_s."""
     ground: Bool[Array, " k"]
     nodes: rays.Nodes
     mu_s_here: Float[Array, "i k n p j"]
@@ -76,7 +82,21 @@ class Rays(eqx.Module):
         reach = jnp.sum(nodes.weight, axis=-1)[:, count.sky :, None, None]
         r_mu_s = (radius + altitude)[:, None, None, None] * mu_s
         mu_s_ground = (r_mu_s + reach * nu[:, count.sky :]) / radius
-        return cls(mu, solid_angle, ground, nodes, mu_s_here, jnp.clip(mu_s_ground, -1, 1), count.azimuths, count.steps)
+        powers = [jnp.ones_like(mu_s)]
+        for _ in range(count.degree):
+            powers.append(powers[-1] / geometry.sine(mu_s))
+        return cls(
+            mu,
+            solid_angle,
+            solid_angle[..., None] * projection(count.degree, mu),
+            jnp.stack(powers)[orders(count.degree)],
+            ground,
+            nodes,
+            mu_s_here,
+            jnp.clip(mu_s_ground, -1, 1),
+            count.azimuths,
+            count.steps,
+        )
 
 
 class Shell(eqx.Module):
@@ -154,12 +174,9 @@ def build(
     start = jnp.broadcast_to(altitude[:, None, None], again.nodes.altitude.shape)
     mu_here = geometry.mu_along(start, again.mu[..., None], again.nodes.distance, bottom_radius)
     nu = relative_nu(again.mu[..., None, None], mu_s, cosines(higher.azimuths, altitude.dtype)[:, None])
-    angular = basis(
-        degree,
-        jnp.broadcast_to(mu_here[..., None, None], again.mu_s_here.shape),
-        again.mu_s_here,
-        jnp.broadcast_to(nu[:, :, None], again.mu_s_here.shape),
-    )
+    here = jnp.broadcast_to(mu_here[..., None, None], again.mu_s_here.shape)
+    angular = azimuthal(degree, here, again.mu_s_here, nu[:, :, None])
+    angular = angular * polar(degree, mu_here)[..., None, None, :]
 
     def sun_rows(value: Cosine) -> Float[Array, "... s pj"]:
         rows = table.cubic_rows(shell.sun_unit(value), suns) * dusk(value, scale)[..., None]

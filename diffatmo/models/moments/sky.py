@@ -12,7 +12,7 @@ from diffatmo import geometry, phase, rays, scattering, table, transmittance
 from diffatmo._types import Altitude, Cosine, Direction, Irradiance, Length, Scalar, Transmittance
 from diffatmo.atmosphere import Atmosphere
 from diffatmo.models.base import Path, Ray, Sky, View
-from diffatmo.models.moments.angular import basis, degrees_of
+from diffatmo.models.moments.angular import azimuthal, degrees, polar
 from diffatmo.models.moments.shell import Shell, dusk
 from diffatmo.models.moments.solve import State, source_moments
 from diffatmo.numerics import safe_divide, safe_sqrt
@@ -86,9 +86,8 @@ class MomentsSky(Sky):
         position = self.shell.altitude_unit(nodes.altitude), self.shell.sun_unit(mu_s_here)
         moments = table.interpolate(by_position, *position).reshape(*mu_here.shape, count, w)
         moments = moments * dusk(mu_s_here, self.shell.grazing())[..., None, None]
-        angular = basis(
-            self.resolution.first_degree, mu_here, mu_s_here, jnp.broadcast_to(nu[..., None], mu_here.shape)
-        )
+        degree = self.resolution.first_degree
+        angular = polar(degree, mu_here) * azimuthal(degree, mu_here, mu_s_here, nu[..., None])
         source = jnp.sum(moments * self._source(nodes.altitude) * angular[..., None], axis=-2)
         light = light + jnp.sum(self._survival(altitude, mu, nodes, steps) * source, axis=-2)
         return Path(jnp.where(misses[..., None], 0, light), jnp.where(misses[..., None], 1, single.transmittance))
@@ -101,7 +100,7 @@ class MomentsSky(Sky):
     def _source(self, altitude: Altitude) -> Float[Array, "... lm w"]:
         """Scattering coefficient times phase moment of every (l, m), km^-1."""
         degree = self.resolution.first_degree
-        return source_moments(self.atmosphere, altitude, degree)[..., degrees_of(self.state.moments.shape[1]), :]
+        return source_moments(self.atmosphere, altitude, degree)[..., degrees(degree), :]
 
     def aureole_phases(self, nu: Cosine) -> list[Float[Array, "..."]]:
         """Phase functions of repeated forward scattering beyond the kept moments, orders 2, 3, …"""
@@ -249,13 +248,9 @@ class MomentsView(View):
         sun_rows = table.cubic_rows(shell.sun_unit(mu_s_here), j) * dusk(mu_s_here, shell.grazing())[..., None]
         moments = jnp.einsum("rncj,rnxj->rncx", there.reshape(*nodes.altitude.shape, count * w, j), sun_rows)
         moments = moments.reshape(*nodes.altitude.shape, count, w, nu.shape[1])
-        angular = basis(
-            size.first_degree,
-            jnp.broadcast_to(mu_here, mu_s_here.shape),
-            mu_s_here,
-            jnp.broadcast_to(nu[:, None], mu_s_here.shape),
-        )
+        angular = azimuthal(size.first_degree, mu_here, mu_s_here, nu[:, None])
         weight = sky._source(nodes.altitude) * sky._survival(altitude, mu, nodes, size.steps)[..., None, :]
+        weight = weight * polar(size.first_degree, mu_here[..., 0])[..., None]
         return jnp.einsum("rnlwx,rnlw,rnxl->rxw", moments, weight, angular)
 
     def _lookup(

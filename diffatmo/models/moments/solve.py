@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from diffatmo import geometry, phase, table, transmittance
 from diffatmo._types import Altitude, Scalar, Transmittance
 from diffatmo.atmosphere import Atmosphere
-from diffatmo.models.moments.angular import cosines, degrees_of, norms, pairs, polynomials, relative_nu
+from diffatmo.models.moments.angular import cosines, degrees, orders, pairs, relative_nu
 from diffatmo.models.moments.shell import Rays, Shell
 from diffatmo.numerics import safe_divide
 
@@ -29,23 +29,14 @@ def _tail(last: Float[Array, "..."], previous: Float[Array, "..."]) -> Float[Arr
 
 
 def _project(
-    rays_: Rays, mu_s: Float[Array, " j"], radiance: Float[Array, "i k w p j"], cosine: Float[Array, " p"], degree: int
+    rays_: Rays, radiance: Float[Array, "i k w p j"], cosine: Float[Array, " p"], degree: int
 ) -> Float[Array, "i lm w j"]:
-    """Moments M_lm of a radiance given at all direction nodes and at azimuths with the given cosines."""
+    """Moments M_lm to ``degree`` of a radiance given at all direction nodes and at azimuths with the given cosines."""
+    count = len(pairs(degree))
     harmonics = table.chebyshev(degree + 1, cosine) * (2 * jnp.pi / cosine.size)
-    by_order = jnp.einsum("ikwpj,pm->mikwj", radiance, harmonics)
-    by_degree = polynomials(degree, rays_.mu)
-    sine, sine_s = geometry.sine(rays_.mu), geometry.sine(mu_s)
-    weight, scale = rays_.solid_angle, jnp.ones_like(sine_s)
-    by_m = []
-    for m in range(degree + 1):
-        functions = jnp.stack([by_degree[order][m] for order in range(m, degree + 1)], axis=-1) * weight[..., None]
-        by_m.append(jnp.einsum("ikwj,ikl->ilwj", by_order[m], functions) / scale)
-        weight, scale = weight * sine, scale * sine_s
-    squared = norms(degree)
-    return jnp.stack(
-        [float(squared[index]) * by_m[m][:, order - m] for index, (order, m) in enumerate(pairs(degree))], axis=1
-    )
+    by_order = jnp.einsum("ikwpj,pm->mikwj", radiance, harmonics)[orders(degree)]
+    moments = jnp.einsum("cikwj,ikc->icwj", by_order, rays_.project[..., :count])
+    return moments * rays_.sun_scale[:count, None]
 
 
 def _irradiance(rays_: Rays, radiance: Float[Array, "i k w p j"]) -> Float[Array, "w j"]:
@@ -103,7 +94,7 @@ def _first_order(atmosphere: Atmosphere, shell: Shell, degree: int, peak_azimuth
     reflected = jnp.einsum("igpjw,fp->igwfj", atmosphere.ground_albedo / jnp.pi * survives * sunlit, to_fine)
     radiance = radiance.at[:, sky_count:].add(reflected)
     radiance = radiance * (atmosphere.solar_irradiance[:, None, None] / shell.dusk)
-    return State(_project(r, shell.mu_s, radiance, fine, degree), _irradiance(r, radiance))
+    return State(_project(r, radiance, fine, degree), _irradiance(r, radiance))
 
 
 class _Transport(eqx.Module):
@@ -114,6 +105,7 @@ class _Transport(eqx.Module):
     weight: Float[Array, "i k n l w"]
     """T times (β_R χ^R_l + β_M χ^M_l) times the quadrature weight."""
     survives: Transmittance
+    degree: int = eqx.field(static=True)
 
     @classmethod
     def build(cls, atmosphere: Atmosphere, shell: Shell, degree: int) -> "_Transport":
@@ -123,7 +115,7 @@ class _Transport(eqx.Module):
         view = jnp.exp(-transmittance.optical_depth(atmosphere, along)) * r.nodes.weight[..., None]
         source = source_moments(atmosphere, r.nodes.altitude, degree)
         survives = jnp.exp(-transmittance.optical_depth(atmosphere, end))[:, r.mu.shape[1] - r.mu_s_ground.shape[1] :]
-        return cls(shell, atmosphere.ground_albedo, view[..., None, :] * source, survives)
+        return cls(shell, atmosphere.ground_albedo, view[..., None, :] * source, survives, degree)
 
     def apply(self, state: State, degree: int) -> State:
         """The next order; its moments to ``degree``."""
@@ -133,14 +125,14 @@ class _Transport(eqx.Module):
         there = jnp.einsum("iknh,hc->iknc", shell.altitude_rows, state.moments.reshape(i, -1))
         moments = jnp.einsum("ikncs,iknst->iknct", there.reshape(i, k, n, count * w, j), shell.sun_rows)
         moments = moments.reshape(i, k, n, count, w, p * j)
-        weight = self.weight[:, :, :, degrees_of(count), :, None]
+        weight = self.weight[:, :, :, degrees(self.degree), :, None]
         radiance = jnp.sum(moments * shell.angular[:, :, :, :, None] * weight, axis=(2, 3))
         falling = jnp.einsum("ws,igst->igwt", state.irradiance, shell.ground_rows)
         reflected = (self.albedo / jnp.pi * self.survives)[..., None] * falling
         radiance = radiance.at[:, k - reflected.shape[1] :].add(reflected)
         radiance = radiance.reshape(i, k, w, p, j) / shell.dusk
         cosine = cosines(p, shell.altitude.dtype)
-        return State(_project(r, shell.mu_s, radiance, cosine, degree), _irradiance(r, radiance))
+        return State(_project(r, radiance, cosine, degree), _irradiance(r, radiance))
 
 
 def source_moments(atmosphere: Atmosphere, altitude: Altitude, degree: int) -> Float[Array, "... l w"]:
@@ -155,7 +147,7 @@ def solve(
     atmosphere: Atmosphere,
     shell: Shell,
     *,
-    orders: int,
+    orders_: int,
     first_degree: int,
     iteration_degree: int,
     higher_degree: int,
@@ -166,10 +158,14 @@ def solve(
     count = len(pairs(iteration_degree))
     seed = State(first.moments[:, :count], first.irradiance)
     transport = _Transport.build(atmosphere, shell, iteration_degree)
-    total, term, previous = seed, seed, seed
-    for _ in range(orders - 1):
-        previous, term = term, transport.apply(term, iteration_degree)
-        total = State(total.moments + term.moments, total.irradiance + term.irradiance)
+
+    def next_order(carry: tuple[State, State, State], _: None) -> tuple[tuple[State, State, State], None]:
+        total, term, _previous = carry
+        following = transport.apply(term, iteration_degree)
+        total = State(total.moments + following.moments, total.irradiance + following.irradiance)
+        return (total, following, term), None
+
+    (total, term, previous), _ = jax.lax.scan(next_order, (seed, seed, seed), None, length=orders_ - 1)
     # Geometric tail: far along the series each order is the one before times a ratio, here that of the mean radiance.
     tail = _tail(term.moments[:, :1], previous.moments[:, :1])
     ground_tail = _tail(term.irradiance, previous.irradiance)

@@ -1,0 +1,190 @@
+"""What a fit leaves behind: complete, readable by machines and people, and never over something else."""
+
+import dataclasses
+import json
+import re
+
+import numpy as np
+import pytest
+import toy_sky
+from rich.console import Console
+
+from diffatmo import atmosphere, imageio, scene
+from fitting import FitError, report
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    directory = tmp_path_factory.mktemp("fit")
+    paths = report.write(toy_sky.result(), directory, truth=toy_sky.truth())
+    return directory, paths
+
+
+def load(directory):
+    def refuse(text):
+        raise AssertionError(f"{text} is not JSON")
+
+    return json.loads((directory / "fit.json").read_text(encoding="utf-8"), parse_constant=refuse)
+
+
+def test_all_files_are_there(written):
+    directory, paths = written
+    images = [
+        f"{kind}_sun_{z}.{end}" for z in (30, 60, 80) for kind in ("fitted", "residual") for end in ("exr", "png")
+    ]
+    expected = {"fit.json", "atmosphere.toml", "report.html", *images}
+    assert {path.name for path in paths} == expected
+    assert {path.name for path in directory.iterdir()} == expected
+
+
+def test_record(written):
+    data, found = load(written[0]), toy_sky.result()
+    assert (data["schema"], data["schema_version"]) == ("diffatmo-fit", 1)
+    assert data["converged"] is True
+    assert data["reduced_chi2"] == pytest.approx(found.reduced_chi2)
+    assert data["wavelengths_nm"] == [680, 550, 440]
+    assert set(data["parameters"]) == set(toy_sky.FREE)
+    g = data["parameters"]["mie_g"]
+    assert g["unit"] == ""
+    assert g["truth"] == pytest.approx(0.8)
+    assert g["initial"] == pytest.approx(0.6)
+    assert g["pull"] == pytest.approx((g["value"] - g["truth"]) / g["standard_error"], rel=1e-3)
+    rayleigh = data["parameters"]["rayleigh_scattering"]
+    assert len(rayleigh["value"]) == len(rayleigh["standard_error"]) == 3
+    assert "rayleigh_optical_depth" in data["derived"]
+    size = len(data["covariance"]["names"])
+    assert np.shape(data["covariance"]["matrix"]) == np.shape(data["correlation"]["matrix"]) == (size, size)
+    assert [image["name"] for image in data["images"]] == ["sun 30", "sun 60", "sun 80"]
+    assert data["images"][1]["sun_zenith_deg"] == pytest.approx(60, abs=1e-3)
+    assert data["images"][0]["residuals"]["rms_sigma"] == pytest.approx([1, 1, 1], abs=0.1)
+    assert [step["step"] for step in data["history"]] == list(range(data["iterations"]))
+    assert data["timings"].keys() == {"compile_s", "solve_s", "total_s"}
+
+
+def test_atmosphere_reads_back_to_the_bit(written):
+    back, found = atmosphere.load(written[0] / "atmosphere.toml"), toy_sky.result().atmosphere
+    for name in toy_sky.FREE:
+        np.testing.assert_array_equal(getattr(back, name), getattr(found, name))
+
+
+def test_pictures(written):
+    shot = scene.load(written[0] / "fitted_sun_60.exr")
+    found = toy_sky.result()
+    np.testing.assert_array_equal(shot.pixels, found.fitted[1])
+    np.testing.assert_array_equal(shot.scene.atmosphere.mie_g, found.atmosphere.mie_g)
+    residual = imageio.read_image(written[0] / "residual_sun_60.exr")
+    np.testing.assert_array_equal(residual.pixels, found.residuals[1])
+    assert residual.wavelengths == (680, 550, 440)
+    for kind in ("fitted", "residual"):
+        assert imageio.read_image(written[0] / f"{kind}_sun_60.png", transfer="srgb").pixels.shape == (16, 64, 3)
+
+
+def test_page_needs_nothing_else(written):
+    page = (written[0] / "report.html").read_text(encoding="utf-8")
+    assert page.count("<img src='data:image/png;base64,") == 3 + 3
+    text = re.sub(r"base64,[^']*", "", page)
+    assert text.count("src=") == text.count("src='data:image/png;'")
+    assert not re.search("http|href|url|import", text)
+    for text in ("Converged after", "mie_single_scattering_albedo", "pull", "sun at zenith angle 60.0°"):
+        assert text in page
+
+
+def test_names_are_made_safe():
+    found = toy_sky.result()
+    names = ["../a b", "a/b", "<b>", "a b"]
+    images = [dataclasses.replace(found.observations[0], name=name) for name in names]
+    assert report.file_names(images) == ["a_b", "a_b_2", "b", "a_b_3"]
+    strange = dataclasses.replace(found, observations=[images[2]], fitted=found.fitted[:1])
+    page = report.page(strange)
+    assert "<b>" not in page
+    assert "&lt;b&gt;" in page
+
+
+def test_nothing_is_overwritten_unless_asked(tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    assert report.check_writable(tmp_path) == tmp_path
+    (tmp_path / "fitted_x.png").write_text("old")
+    with pytest.raises(FitError, match="holds a report already"):
+        report.check_writable(tmp_path)
+    with pytest.raises(FitError, match="holds a report already"):
+        report.write(toy_sky.result(), tmp_path)
+    assert report.check_writable(tmp_path, overwrite=True) == tmp_path
+    assert (tmp_path / "notes.txt").read_text() == "mine"
+
+
+def test_a_place_that_cannot_be_written_to(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(FitError, match="file: cannot be written to"):
+        report.check_writable(tmp_path / "file")
+    with pytest.raises(FitError, match="cannot be written to"):
+        report.check_writable(tmp_path / "file" / "below")
+    report.check_writable(tmp_path / "new" / "folder")
+    assert (tmp_path / "new" / "folder").is_dir()
+
+
+def test_one_failure_does_not_take_the_rest_along(tmp_path, monkeypatch):
+    def full(path, *_, **__):
+        raise imageio.ImageError(f"{path}: cannot be written: No space left on device")
+
+    monkeypatch.setattr(imageio, "write_png", full)
+    monkeypatch.setattr(report, "page", lambda _: "page")
+    with pytest.raises(OSError, match=r"fitted_sun_30\.png: cannot be written: No space left.*residual_sun_80\.png"):
+        report.write(toy_sky.result(), tmp_path)
+    present = {path.name for path in tmp_path.iterdir()}
+    assert {"fit.json", "atmosphere.toml", "report.html", "fitted_sun_30.exr"} <= present
+    assert not any(name.endswith(".png") or ".part" in name for name in present)
+
+
+def test_unfinished_and_undetermined_results_are_reported(tmp_path):
+    found = toy_sky.result()
+    unknown = dataclasses.replace(found.parameters[0], standard_error=None, at_bound=False)
+    held = dataclasses.replace(found.parameters[1], at_bound=True)
+    covariance = found.covariance.copy()
+    covariance[0] = covariance[:, 0] = np.nan
+    broken = dataclasses.replace(
+        found,
+        converged=False,
+        message="stopped: not converged in the steps allowed",
+        parameters=[unknown, held, *found.parameters[2:]],
+        covariance=covariance,
+        undetermined=[unknown.name],
+        error_scale=2.0,
+        history=[
+            found.history[0]._replace(chi2=float("inf"), reduced_chi2=float("inf"), accepted=False),
+            *found.history,
+        ],
+    )
+    data = json.loads(json.dumps(report.record(broken), allow_nan=False))
+    assert data["converged"] is False
+    assert data["parameters"]["rayleigh_scattering"]["standard_error"][0] is None
+    assert data["covariance"]["matrix"][0] == [None] * len(covariance)
+    assert data["history"][0]["chi2"] is None
+    page = report.page(broken)
+    for text in ("Not converged", "do not determine rayleigh_scattering_680", "At the bound", "2.0 times"):
+        assert text in page
+
+
+def test_table_fits_into_eighty_columns():
+    console = Console(width=80, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
+    with console.file:
+        console.print(report.table(toy_sky.result(), toy_sky.truth()))
+    text = console.export_text()
+    assert "…" not in text
+    assert re.search(r"mie_g +0\.\d+ +0\.000\d+ +0\.6 +0\.8 +[+-]\d\.\d", text)
+    assert "pull" not in "".join(str(column.header) for column in report.table(toy_sky.result()).columns)
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "text"),
+    [
+        (0.0058065, 7.4e-6, "0.0058065"),
+        (7.993456, 0.0074, "7.9935"),
+        (33.123456, 12.0, "33"),
+        (0.3, None, "0.3"),
+        (0.0, 0.1, "0"),
+        (float("nan"), None, "–"),
+        (1234.5678, 1e-9, "1234.5678"),
+    ],
+)
+def test_numbers_show_the_digits_that_mean_something(value, error, text):
+    assert report.format_number(value, error) == text

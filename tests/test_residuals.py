@@ -1,0 +1,85 @@
+"""Whitened residuals, and the coloured Jacobian against the plain one."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import toy_sky
+
+from diffatmo.models import RayMarch
+from fitting.observation import sigma, stack
+from fitting.parameters import select
+from fitting.residuals import Problem, jacobian, linearise, residuals, triangle
+
+NM = [680.0, 550.0, 440.0]
+
+
+def problem(model, free, scaled=(), exposure=("fixed", "fixed"), pixels=40):
+    mask = np.zeros((16, 64), bool)
+    mask.flat[:: 16 * 64 // pixels] = True
+    images = toy_sky.observations(zeniths=(30.0, 80.0), mask=mask, exposure=exposure)
+    # Only the pixels that are used, and one that is not, whatever it holds.
+    images = [eqx.tree_at(lambda o: o.shown, image, image.used.copy()) for image in images]
+    images[0].shown[0, 1] = True
+    images[0].image[0, 1] = np.nan
+    batch = stack(images, NM)
+    parameters = select(toy_sky.truth(), free, scaled)
+    weight = jnp.where(batch.used[..., None], 1 / sigma(batch, batch.measured), 0)
+    y = jnp.concatenate([parameters.start, 0.1 * jnp.arange(batch.exposure_count)])
+    return Problem(model, parameters, batch, weight), y
+
+
+@eqx.filter_jit
+def both(y, ours):
+    return jacobian(y, linearise(ours.split(y)[0], ours), ours)
+
+
+def test_coloured_jacobian_is_the_jacobian(x64):
+    ours, y = problem(toy_sky.Toy(), toy_sky.FREE, scaled=["mie_absorption"], exposure=("free", "lens-per-channel"))
+    assert ours.batch.exposure_count == 4
+    residual, coloured = both(y, ours)
+    np.testing.assert_allclose(residual, eqx.filter_jit(residuals)(y, ours), rtol=1e-12)
+    plain = eqx.filter_jit(jax.jacfwd(residuals))(y, ours)
+    np.testing.assert_allclose(coloured, plain, atol=1e-10 * np.abs(plain).max())
+
+
+def test_wavelengths_do_not_mix_in_a_real_model(x64):
+    free = ["rayleigh_scattering", "mie_absorption", "ozone_absorption", "ground_albedo"]
+    ours, y = problem(RayMarch(), free, pixels=6)
+    _, coloured = both(y, ours)
+    plain = eqx.filter_jit(jax.jacfwd(residuals))(y, ours)
+    np.testing.assert_allclose(coloured, plain, atol=1e-10 * np.abs(plain).max())
+
+
+def test_one_tangent_for_each_field():
+    ours, y = problem(toy_sky.Toy(), toy_sky.FREE)
+    assert eqx.filter_eval_shape(linearise, y, ours).tangents.shape[-1] == len(toy_sky.FREE)
+    assert y.size > 2 * len(toy_sky.FREE)
+
+
+def test_unused_pixels_do_not_count():
+    ours, y = problem(toy_sky.Toy(), ["mie_g"], exposure=("free", "fixed"))
+    residual, slope = both(y, ours)
+    unused = ~np.repeat(np.asarray(ours.batch.used).reshape(-1), 3)
+    assert unused.any()
+    assert np.all(residual[unused] == 0)
+    assert np.all(slope[unused] == 0)
+
+
+def test_residuals_at_the_truth_are_the_noise():
+    ours, y = problem(toy_sky.Toy(), ["mie_g"], pixels=512)
+    whitened = eqx.filter_jit(residuals)(y, ours)[np.repeat(np.asarray(ours.batch.used).reshape(-1), 3)]
+    # About 3000 normal numbers: their standard deviation is known to 1.3 %.
+    assert float(jnp.std(whitened)) == pytest.approx(1, abs=0.06)
+
+
+def test_triangle_holds_what_least_squares_needs():
+    random = np.random.default_rng(1)
+    slope, residual = random.standard_normal((500, 4)), random.standard_normal(500)
+    factor = np.asarray(triangle(jnp.asarray(residual, jnp.float32), jnp.asarray(slope, jnp.float32)), float)
+    r, z = factor[:-1, :-1], factor[:-1, -1]
+    # Float32 rounding of sums of 500 terms.
+    np.testing.assert_allclose(r.T @ r, slope.T @ slope, atol=1e-3)
+    np.testing.assert_allclose(r.T @ z, slope.T @ residual, atol=1e-3)
+    assert np.sum(factor[:, -1] ** 2) == pytest.approx(np.sum(residual**2), rel=1e-5)

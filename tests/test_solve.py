@@ -1,0 +1,159 @@
+"""The search: it finds the optimum from far off, respects bounds, and when it cannot converge it says so."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import toy_sky
+from toy_sky import FREE, Toy
+
+from diffatmo.models.base import Ray
+from fitting import FitError, fit
+from fitting.solve import distance, solve
+
+
+@pytest.mark.parametrize(("factor", "g"), [(1.3, 0.6), (0.7, 0.9)])
+def test_converges_from_thirty_percent_off(factor, g):
+    found = fit(toy_sky.observations(noise=0.01), init=toy_sky.start(factor, g), free=FREE, model=Toy())
+    assert found.converged
+    assert found.iterations < 20
+    # 9216 residuals: reduced χ² is known to 1.5 %.
+    assert found.reduced_chi2 == pytest.approx(1, abs=0.06)
+    for estimate in found.with_truth(toy_sky.truth()).parameters:
+        assert abs(estimate.pull) < 5, estimate
+
+
+def test_without_noise_the_truth_comes_back():
+    found = fit(toy_sky.observations(noise=0.0), init=toy_sky.start(), free=FREE, model=Toy(), tolerance=1e-3)
+    assert found.converged
+    for estimate in found.with_truth(toy_sky.truth()).parameters:
+        # A float32 residual is good to 1e-4 sigma.
+        assert abs(estimate.pull) < 1e-2, estimate
+
+
+def test_starts_at_zero_and_finds_what_is_there():
+    init = toy_sky.change(toy_sky.start(), mie_absorption=0.0, ozone_absorption=0.0, ground_albedo=0.0)
+    found = fit(toy_sky.observations(), init=init, free=FREE, model=Toy())
+    assert found.converged
+    assert found.chi2 == pytest.approx(toy_sky.result().chi2, abs=0.1)
+
+
+def test_a_true_zero_is_reached_and_marked():
+    # With as little as that, noise alone puts the optimum of some wavelengths below zero.
+    truth = toy_sky.change(toy_sky.truth(), mie_absorption=0.0, ozone_absorption=0.0)
+    images = toy_sky.observations(atmosphere=truth)
+    found = fit(images, init=toy_sky.start(), free=FREE, model=Toy()).with_truth(truth)
+    assert found.converged
+    held = [e for e in found.parameters if e.at_bound]
+    assert held
+    assert {e.field for e in held} <= {"mie_absorption", "ozone_absorption"}
+    assert all(e.value == 0 for e in held)
+    assert all(abs(e.pull) < 5 for e in found.parameters if e.pull is not None)
+
+
+def test_weights_from_noisy_pixels_would_bias():
+    """With sigma from the measured pixel the amplitude comes out low by 2 noise²: 2 %, many times its error."""
+    images = toy_sky.observations(noise=0.1)
+    found = solve(images, init=toy_sky.truth(), free=["solar_irradiance"], scaled=["solar_irradiance"], model=Toy())
+    first = max(step.step for step in found.history if step.stage == 1)
+    assert first < len(found.history) - 1
+    amplitude = float(found.parameters.atmosphere(found.y).solar_irradiance[0])
+    assert amplitude == pytest.approx(1, abs=4 * 0.1 / np.sqrt(found.residual_count))
+    # What the first pass found, from the linearisation at the last point: measured weights.
+    d, e = (np.concatenate([x[o.used].ravel() for x, o in zip(xs, images, strict=True)]) for xs in _pairs(images))
+    assert np.sum(e / d) / np.sum(e**2 / d**2) == pytest.approx(1 - 2 * 0.1**2, abs=0.006)
+
+
+def _pairs(images):
+    return [o.image for o in images], [toy_sky.image(toy_sky.truth(), float(o.name.split()[1])) for o in images]
+
+
+def test_free_exposures_are_recovered():
+    images = toy_sky.observations(factors=(20.0, 0.05, 0.05), exposure=("free", "lens", "lens"))
+    free = ["mie_g", "mie_scattering", "ground_albedo"]
+    init = toy_sky.change(toy_sky.truth(), mie_g=0.6, mie_scattering=6e-3, ground_albedo=0.0)
+    found = fit(images, init=init, free=free, model=Toy())
+    assert found.converged
+    assert [e.name for e in found.exposures] == ["exposure_sun 30", "exposure_lens"]
+    for estimate, factor in zip(found.exposures, (20.0, 0.05), strict=True):
+        assert abs(estimate.value - factor) < 5 * estimate.standard_error
+        assert estimate.standard_error < 0.01 * factor
+
+
+def test_out_of_steps_returns_the_best_point():
+    found = fit(toy_sky.observations(), init=toy_sky.start(), free=FREE, model=Toy(), max_steps=3)
+    assert not found.converged
+    assert "not converged in the steps allowed" in found.message
+    accepted = [step.chi2 for step in found.history if step.accepted and step.stage == found.history[-1].stage]
+    assert found.chi2 == pytest.approx(min(accepted))
+    assert np.all(np.isfinite([e.value for e in found.parameters]))
+
+
+def test_an_interrupt_returns_the_best_point():
+    def stop(step):
+        if step.step == 2:
+            raise KeyboardInterrupt
+
+    found = fit(toy_sky.observations(), init=toy_sky.start(), free=FREE, model=Toy(), progress=stop)
+    assert not found.converged
+    assert found.message == "interrupted by the user"
+    assert found.chi2 < found.history[0].chi2
+
+
+def test_progress_sees_every_step():
+    seen = []
+    found = fit(toy_sky.observations(), init=toy_sky.start(), free=FREE, model=Toy(), progress=seen.append)
+    assert seen == found.history
+    assert [step.step for step in seen] == list(range(len(seen)))
+    assert seen[-1].distance < 0.1
+
+
+class Cliff(Toy):
+    """A model that has no answer for forward peaks sharper than 0.85."""
+
+    def sky(self, atmosphere):
+        return _CliffSky(atmosphere)
+
+
+class _CliffSky(toy_sky.ToySky):
+    def radiance(self, *, altitude, view, sun):
+        ray = super().radiance(altitude=altitude, view=view, sun=sun)
+        return Ray(jnp.where(self.atmosphere.mie_g > 0.85, jnp.nan, ray.radiance), ray.transmittance)
+
+
+def test_a_model_that_fails_on_the_way_is_walked_around():
+    # From this start the first full step leads over the edge.
+    found = fit(toy_sky.observations(), init=toy_sky.start(1.5, -0.2), free=FREE, model=Cliff())
+    assert any(not np.isfinite(step.chi2) for step in found.history)
+    assert found.converged
+    assert found.estimate("mie_g").value == pytest.approx(0.8, abs=0.002)
+
+
+def test_a_model_that_fails_at_the_start_is_an_error():
+    with pytest.raises(FitError, match=r"^sun 30: the model's radiance at the start: not finite in \d+ of"):
+        fit(toy_sky.observations(), init=toy_sky.start(1.0, 0.9), free=["mie_g"], model=Cliff())
+
+
+def test_refuses():
+    images = toy_sky.observations()
+    for options, message in [
+        ({"max_steps": 0}, "max_steps"),
+        ({"tolerance": 0.0}, "tolerance"),
+        ({"free": ["nothing"]}, "'nothing' cannot be free"),
+    ]:
+        with pytest.raises(FitError, match=message):
+            fit(images, **({"init": toy_sky.start(), "free": ["mie_g"], "model": Toy()} | options))
+    one = eqx.tree_at(lambda o: o.used, images[0], images[0].used & (np.arange(16 * 64).reshape(16, 64) == 500))
+    with pytest.raises(FitError, match="3 pixels and channels cannot determine"):
+        fit([one], init=toy_sky.start(), free=FREE, model=Toy())
+
+
+def test_distance_is_the_fall_of_chi2_of_a_linear_problem():
+    random = np.random.default_rng(0)
+    slope, residual = 100 * random.standard_normal((50, 3)), random.standard_normal(50)
+    factor = np.linalg.qr(np.column_stack([slope, residual]), mode="r")
+    rest = residual - slope @ np.linalg.lstsq(slope, residual)[0]
+    fall = residual @ residual - rest @ rest
+    # Directions with an error of 1/700 count in full but for its square.
+    assert distance(factor) == pytest.approx(np.sqrt(fall), rel=1e-4)
+    assert distance(factor, misfit=4.0) == pytest.approx(np.sqrt(fall) / 2, rel=1e-4)
