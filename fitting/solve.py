@@ -136,8 +136,9 @@ def _step(y: Coordinates, state: Any, plane: tuple[Array, Array, Array]) -> tupl
 def distance(factor: Float[np.ndarray, "n+1 n+1"], misfit: float = 1.0) -> float:
     """Distance to the optimum, in standard errors, in the directions that the data determine.
 
-    Its square is the amount by which χ² / ``misfit`` would still fall if the residuals were linear. A direction with the standard error s, in
-    natural units of the coordinates, counts by 1 / (1 + s²). The variance of the noise is ``misfit`` times the stated one.
+    Its square is the amount by which χ² / ``misfit`` would still fall if the residuals were linear; the variance of the
+    noise is taken to be ``misfit`` times the stated one. A direction with the standard error s, in natural units of the
+    coordinates, counts by 1 / (1 + s²).
     """
     left, singular, _ = np.linalg.svd(factor[:, :-1] / math.sqrt(misfit), full_matrices=False)
     along = left.T @ factor[:, -1] / math.sqrt(misfit)

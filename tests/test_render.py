@@ -125,8 +125,8 @@ def test_sun_of_another_planet(s1):
 def check(shot_of, at, air, model, step=1e-5, **options):
     """Forward and reverse derivatives of a picture against central differences.
 
-    ``shot_of(parameters, air)`` is the scene; the atmosphere is an argument, because what a compiled function closes over
-    is folded into constants, for minutes.
+    ``shot_of(parameters, air)`` is the scene; the atmosphere is an argument, because what a compiled function closes
+    over is folded into constants, for minutes.
     """
 
     def picture(parameters, air):

@@ -48,7 +48,7 @@ def test_exposure_and_sun_cannot_be_told_apart():
 
 
 def test_error_bars_are_calibrated():
-    runs = 24
+    runs = 16
     squares, pulls = [], []
     for seed in range(runs):
         found = fit(toy_sky.observations(seed), init=toy_sky.start(1.2, 0.75), free=FREE, model=Toy())
@@ -57,16 +57,16 @@ def test_error_bars_are_calibrated():
         error = np.array([e.value - e.truth for e in found.parameters if not e.derived])
         squares.append(error @ np.linalg.solve(found.covariance, error))
         pulls.append([e.pull for e in found.parameters])
-    # χ² with 18 degrees of freedom in each run: the mean of 24 has a standard deviation of 1.2.
-    assert np.mean(squares) == pytest.approx(18, abs=4.9)
+    # χ² with 18 degrees of freedom in each run: the mean of 16 has a standard deviation of 1.5.
+    assert np.mean(squares) == pytest.approx(18, abs=6)
     assert np.all(np.abs(np.mean(pulls, axis=0)) < 4 / np.sqrt(runs))
     deviation = np.std(pulls, axis=0)
-    assert np.all((deviation > 0.4) & (deviation < 1.6))
+    assert np.all((deviation > 0.3) & (deviation < 1.7))
 
 
 def test_understated_noise_widens_the_errors():
     honest, bold = (
-        fit(toy_sky.observations(noise=0.03, **said), init=toy_sky.truth(), free=["mie_g"], model=Toy())
+        fit(toy_sky.observations(noise=0.03, **said), init=toy_sky.truth(), free=FREE, model=Toy())
         for said in ({}, {"stated": 0.01})
     )
     assert bold.reduced_chi2 == pytest.approx(9 * honest.reduced_chi2, rel=0.01)

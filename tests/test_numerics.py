@@ -1,0 +1,48 @@
+"""The guarded primitives: values where they are defined, finite derivatives everywhere."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import special
+
+from diffatmo import numerics
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+@pytest.mark.parametrize(
+    ("function", "points"),
+    [
+        (numerics.safe_sqrt, [-1.0, 0.0, 1e-30, 2.0]),
+        (numerics.safe_log, [-1.0, 0.0, 1e-30, 2.0]),
+        (numerics.safe_arccos, [-2.0, -1.0, 0.3, 1.0, 2.0]),
+        (lambda x: numerics.safe_divide(1 + x, x), [0.0, 2.0]),
+        (lambda x: numerics.safe_norm(jnp.stack([x, x])), [0.0, 1.0]),
+    ],
+)
+def test_value_and_derivative_are_finite(x64, dtype, function, points):
+    x = jnp.asarray(points, dtype)
+    assert jnp.isfinite(jax.vmap(function)(x)).all()
+    assert jnp.isfinite(jax.vmap(jax.grad(function))(x)).all()
+    assert jnp.isfinite(jax.vmap(jax.jacfwd(function))(x)).all()
+
+
+def test_values_agree_with_numpy_where_it_has_one():
+    x = jnp.linspace(0.1, 0.9, 9)
+    np.testing.assert_allclose(numerics.safe_sqrt(x), np.sqrt(x), rtol=1e-6)
+    np.testing.assert_allclose(numerics.safe_log(x), np.log(x), rtol=1e-6)
+    np.testing.assert_allclose(numerics.safe_arccos(x), np.arccos(x), rtol=1e-5)
+
+
+def test_scaled_erfcx_agrees_with_scipy(x64):
+    """1.2e-7 is the stated accuracy of the fit."""
+    x = jnp.linspace(0, 120, 500)
+    np.testing.assert_allclose(numerics.scaled_erfcx(x, jnp.zeros_like(x)), special.erfcx(np.asarray(x)), rtol=2e-7)
+    np.testing.assert_allclose(numerics.scaled_erfcx(x, x * 0 - 2), np.exp(-2) * special.erfcx(np.asarray(x)), rtol=2e-7)
+
+
+def test_gauss_legendre_is_exact_to_degree_2n_minus_1():
+    x, w = numerics.gauss_legendre(4, 1.0, 3.0)
+    for degree in range(8):
+        assert w @ x**degree == pytest.approx((3.0 ** (degree + 1) - 1) / (degree + 1), rel=1e-13)
+    assert w @ x**8 != pytest.approx((3.0**9 - 1) / 9, rel=1e-7)
