@@ -36,7 +36,10 @@ def _turn(matrix: Float[Array, "3 3"], vectors: Direction) -> Direction:
 
 
 class Camera(eqx.Module):
-    """A picture of ``height`` rows and ``width`` columns with a pose. Raises :class:`CameraError` for a bad value."""
+    """A picture of ``height`` rows and ``width`` columns with a pose. Raises :class:`CameraError` for a bad value.
+
+    The public methods are compiled as a whole: operation by operation, the first call would take a second.
+    """
 
     height: eqx.AbstractVar[int]
     width: eqx.AbstractVar[int]
@@ -63,7 +66,7 @@ class Camera(eqx.Module):
         return False
 
     @abstractmethod
-    def solid_angles(self) -> Float[Array, "height width"]:
+    def _solid_angles(self) -> Float[Array, "height width"]:
         """Solid angle of every pixel, sr."""
 
     def _covers(self, x: Float[Array, "..."], y: Float[Array, "..."]) -> Bool[Array, "..."]:
@@ -82,22 +85,32 @@ class Camera(eqx.Module):
         up = jnp.stack([-sy * sp, -cy * sp, cp])
         return jnp.stack([cr * right - sr * up, forward, sr * right + cr * up], axis=-1)
 
+    @eqx.filter_jit
     def directions_at(self, x: Float[Array, "..."], y: Float[Array, "..."]) -> Direction:
         """Unit vectors, local frame, towards any points (x, y) of the picture."""
         return _turn(self.rotation(), self._rays(x, y))
 
+    @eqx.filter_jit
     def directions(self) -> Float[Array, "height width 3"]:
         """Unit vectors, local frame, towards the centres of all pixels."""
         return self.directions_at(*self._grid())
 
+    @eqx.filter_jit
     def pixels(self, directions: Direction) -> Float[Array, "... 2"]:
         """(x, y) of local directions: the inverse of :meth:`directions_at` for all that the camera sees."""
         return jnp.stack(self._project(_turn(self.rotation().T, directions)), axis=-1)
 
+    @eqx.filter_jit
     def sees(self, directions: Direction) -> Bool[Array, "..."]:
         """Whether local directions fall inside the picture."""
         return self._covers(*self._project(_turn(self.rotation().T, directions)))
 
+    @eqx.filter_jit
+    def solid_angles(self) -> Float[Array, "height width"]:
+        """Solid angle of every pixel, sr: exact for a panorama, otherwise from the pixel's centre."""
+        return self._solid_angles()
+
+    @eqx.filter_jit
     def valid(self) -> Bool[Array, "height width"]:
         """Which pixels show anything: all but those outside a fisheye's circle."""
         return self._covers(*self._grid())
@@ -146,8 +159,8 @@ class Equirectangular(Camera):
         zenith = jnp.arctan2(safe_norm(rays[..., :2]), rays[..., 2])
         return turns * self.width - 0.5, zenith / self.pixel_angle - 0.5
 
-    def solid_angles(self) -> Float[Array, "height width"]:
-        """Solid angle of every pixel, sr: exact, 2π/width (cos θ_top - cos θ_bottom)."""
+    def _solid_angles(self) -> Float[Array, "height width"]:
+        # Exact: 2π/width (cos θ_top - cos θ_bottom).
         zenith = (_array(jnp.arange(self.height)) + 0.5) * self.pixel_angle
         row = 2 * np.pi / self.width * 2 * np.sin(self.pixel_angle / 2) * jnp.sin(zenith)
         return jnp.broadcast_to(row[:, None], (self.height, self.width))
@@ -198,8 +211,7 @@ class Fisheye(Camera):
         _, _, distance = self._centred(x, y)
         return super()._covers(x, y) & (distance <= min(self.height, self.width) / 2)
 
-    def solid_angles(self) -> Float[Array, "height width"]:
-        """Solid angle of every pixel, sr, by its value at the pixel's centre."""
+    def _solid_angles(self) -> Float[Array, "height width"]:
         _, _, distance = self._centred(*self._grid())
         return self.pixel_angle**2 * jnp.sinc(distance * self.pixel_angle / np.pi)
 
@@ -240,8 +252,7 @@ class Pinhole(Camera):
         y = (self.height - 1) / 2 - rays[..., 2] * scale
         return jnp.where(ahead, x, -2.0 * self.width), jnp.where(ahead, y, -2.0 * self.height)
 
-    def solid_angles(self) -> Float[Array, "height width"]:
-        """Solid angle of every pixel, sr, by its value at the pixel's centre."""
+    def _solid_angles(self) -> Float[Array, "height width"]:
         return self.pixel_angle**2 / safe_norm(self._plane(*self._grid())) ** 3
 
 

@@ -2,7 +2,7 @@
 
 The path is: radiance at ``w`` wavelengths → linear sRGB (:func:`to_linear_srgb`) → exposure and tone curve
 (:func:`tone_map`) → the sRGB transfer function (:func:`srgb_encode`); :func:`display` is all of it. Every step is
-continuous and differentiable.
+continuous and differentiable. What takes many operations is compiled as a whole; one by one they would cost a second.
 """
 
 from functools import cache
@@ -36,6 +36,7 @@ def _observer() -> tuple[np.ndarray, np.ndarray]:
     return table[:, 0], table[:, 1:]
 
 
+@jax.jit
 def xyz_weights(wavelengths: Spectrum) -> Float[Array, "w 3"]:
     """Contribution of a unit of radiance at each wavelength to X, Y, Z.
 
@@ -51,6 +52,7 @@ def xyz_weights(wavelengths: Spectrum) -> Float[Array, "w 3"]:
     return hats @ jnp.asarray(matching / matching.sum(axis=0))
 
 
+@jax.jit
 def to_linear_srgb(radiance: Radiance, *, wavelengths: Spectrum) -> Float[Array, "... 3"]:
     """Linear sRGB of a spectrum; components are negative for colours outside the gamut.
 
@@ -71,6 +73,7 @@ def luminance(rgb: Float[Array, "... 3"]) -> Float[Array, "..."]:
     return rgb @ jnp.asarray(LUMINANCE, dtype=rgb.dtype)
 
 
+@jax.jit
 def auto_exposure(rgb: Float[Array, "... 3"], *, percentile: float = 90.0, level: float = 1.0) -> Float[Array, ""]:
     """The factor that brings the given percentile of luminance to ``level``; 1 for a picture that is black there.
 
@@ -98,6 +101,7 @@ def srgb_decode(encoded: Float[Array, "..."]) -> Float[Array, "..."]:
     return jnp.where(low, encoded / 12.92, ((jnp.where(low, 1, encoded) + 0.055) / 1.055) ** 2.4)
 
 
+@jax.jit
 def display(
     radiance: Radiance, *, wavelengths: Spectrum, exposure: float | Float[Array, ""] = 1.0
 ) -> Float[Array, "... 3"]:

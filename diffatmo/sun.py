@@ -1,7 +1,9 @@
 """The sun: its direction, the radiance of its disc, and where it is in a picture that shows it."""
 
+from functools import partial
 from typing import NamedTuple, Protocol
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -15,6 +17,7 @@ class SunError(ValueError):
     """A picture does not show one sun; the message says what it shows."""
 
 
+@jax.jit
 def direction(*, zenith: float | Scalar, azimuth: float | Scalar) -> Direction:
     """Unit vector (x east, y north, z up) towards a zenith angle and an azimuth clockwise from north, rad."""
     zenith, azimuth = jnp.asarray(zenith, jnp.result_type(float)), jnp.asarray(azimuth, jnp.result_type(float))
@@ -22,6 +25,7 @@ def direction(*, zenith: float | Scalar, azimuth: float | Scalar) -> Direction:
     return jnp.stack(jnp.broadcast_arrays(sine * jnp.sin(azimuth), sine * jnp.cos(azimuth), jnp.cos(zenith)), axis=-1)
 
 
+@jax.jit
 def angles(direction: Direction) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
     """Zenith angle and azimuth in [0, 2π), rad, of unit vectors; the azimuth of the zenith is 0 with derivative 0."""
     east, north = direction[..., 0], direction[..., 1]
@@ -39,6 +43,7 @@ def limb_exponent(wavelengths: Spectrum) -> Spectrum:
     return -0.023 + 0.292 / (jnp.maximum(wavelengths, 416.0) * 1e-3)
 
 
+@jax.jit
 def disc_radiance(
     *,
     view: Direction,
@@ -63,6 +68,7 @@ def disc_radiance(
     return mean * (1 + exponent / 2) * darkening
 
 
+@partial(jax.jit, static_argnames="count")
 def disc_points(
     sun: Direction, *, wavelengths: Spectrum, count: int = 4096, angular_radius: float | Scalar = SUN_ANGULAR_RADIUS
 ) -> tuple[Float[Array, "count 3"], Float[Array, "count w"]]:

@@ -29,6 +29,11 @@ class Columns(NamedTuple):
     absorber: Float[Array, "..."]
 
 
+def extinction(atmosphere: Atmosphere) -> Float[Array, "3 w"]:
+    """Extinction per unit density of the three constituents, km^-1."""
+    return jnp.stack([atmosphere.rayleigh_scattering, atmosphere.mie_extinction, atmosphere.ozone_absorption])
+
+
 def optical_depth(atmosphere: Atmosphere, columns: Columns) -> OpticalDepth:
     """Optical depth of columns (km) of the three constituents."""
     return (
@@ -70,7 +75,7 @@ def tent_column(atmosphere: Atmosphere, perigee: Altitude, start: Length, end: L
         total = jnp.zeros_like(low)
         for position, weight in zip(t, w, strict=True):
             z = low + (high - low) * position
-            h = perigee + z * z / (safe_sqrt(from_center * from_center + z * z) + from_center)
+            h = perigee + safe_divide(z * z, safe_sqrt(from_center * from_center + z * z) + from_center)
             total = total + weight * (a - h)
         return (high - low) * total
 

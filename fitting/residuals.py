@@ -9,7 +9,7 @@ channel w is the derivative with respect to number w alone; exposures need no ta
 wavelengths thus cost as many forward derivatives as there are *fields*, not numbers.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from diffatmo.models.base import Model, Sky
+from diffatmo.models import Model, Moments, Sky
 from fitting.observation import Batch
 from fitting.parameters import Coordinates, Parameters
 
@@ -25,12 +25,24 @@ Predicted = Float[Array, "image pixel w"]
 
 
 class Problem(eqx.Module):
-    """All that the residuals depend on besides ``y``; ``weight`` is 1/sigma, and 0 for pixels that are not used."""
+    """All that the residuals depend on besides ``y``.
+
+    ``weight`` is 1/sigma, and 0 for pixels that are not used; ``shell`` is what the model knows of the planet alone, if
+    it makes use of that and the planet is not free.
+    """
 
     model: Model
     parameters: Parameters
     batch: Batch
     weight: Predicted
+    shell: Any = None
+
+    def sky(self, coordinates: Coordinates) -> Sky:
+        """The sky at coordinates of the atmosphere."""
+        atmosphere = self.parameters.atmosphere(coordinates)
+        if isinstance(self.model, Moments) and self.shell is not None:
+            return self.model.sky(atmosphere, self.shell)
+        return self.model.sky(atmosphere)
 
     def split(self, y: Coordinates) -> tuple[Coordinates, Float[Array, " e"]]:
         """The coordinates of the atmosphere, and the logarithms of the exposures."""
@@ -42,6 +54,15 @@ class Problem(eqx.Module):
         lower, upper = self.parameters.limits
         endless = jnp.full(self.batch.exposure_count, jnp.inf, lower.dtype)
         return jnp.concatenate([lower, -endless]), jnp.concatenate([upper, endless])
+
+
+@eqx.filter_jit
+def planet_shell(model: Model, parameters: Parameters) -> Any:
+    """The geometry that ``model`` would else compute in each step; None if there is none or the planet is free."""
+    if not isinstance(model, Moments) or {"bottom_radius", "top_radius"} & {b.field for b in parameters.blocks}:
+        return None
+    init = parameters.init
+    return model.shell(bottom_radius=init.bottom_radius, top_altitude=init.top_altitude)
 
 
 def predict(sky: Sky, batch: Batch) -> Predicted:
@@ -69,7 +90,7 @@ def linearise(coordinates: Coordinates, problem: Problem) -> Linearisation:
     colour, _ = problem.parameters.colours()
 
     def radiance(c: Coordinates) -> Predicted:
-        return predict(problem.model.sky(problem.parameters.atmosphere(c)), problem.batch)
+        return predict(problem.sky(c), problem.batch)
 
     seeds = jnp.asarray(colour == np.arange(colour.max() + 1)[:, None], dtype=coordinates.dtype)
     tangent = jax.vmap(lambda seed: jax.jvp(radiance, (coordinates,), (seed,)), out_axes=(None, -1))
@@ -79,7 +100,7 @@ def linearise(coordinates: Coordinates, problem: Problem) -> Linearisation:
 def residuals(y: Coordinates, problem: Problem) -> Float[Array, " residual"]:
     """(expected - measured) / sigma of every pixel and channel; 0 for those not used."""
     coordinates, log_factors = problem.split(y)
-    radiance = predict(problem.model.sky(problem.parameters.atmosphere(coordinates)), problem.batch)
+    radiance = predict(problem.sky(coordinates), problem.batch)
     return _whiten(radiance * problem.batch.exposure(log_factors), problem).reshape(-1)
 
 

@@ -34,7 +34,7 @@ from diffatmo.models.base import Model
 from fitting._errors import FitError
 from fitting.observation import Batch, Observation, exposures, sigma, stack
 from fitting.parameters import Coordinates, Parameters, select
-from fitting.residuals import Linearisation, Predicted, Problem, jacobian, linearise, triangle
+from fitting.residuals import Linearisation, Predicted, Problem, jacobian, linearise, planet_shell, triangle
 
 TOLERANCE = 0.1
 """Distance to the optimum, in standard errors, at which the fit has converged."""
@@ -311,7 +311,8 @@ def solve(
         raise FitError(
             f"{_count(batch)} pixels and channels cannot determine {size} parameters; mask less or free less"
         )
-    problem = _weigh(Problem(model, parameters, batch, jnp.zeros_like(batch.measured)), batch.measured)
+    shell = planet_shell(model, parameters)
+    problem = _weigh(Problem(model, parameters, batch, jnp.zeros_like(batch.measured), shell), batch.measured)
     seconds: list[float] = []
 
     def evaluate(y: Coordinates, problem: Problem) -> Linearisation:

@@ -2,9 +2,11 @@
 
 from pathlib import Path
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import matplotlib
+import numpy as np
 import pytest
 
 from diffatmo.atmosphere import Atmosphere
@@ -45,3 +47,34 @@ def s1() -> Atmosphere:
         ozone_absorption=jnp.zeros(3),
         ground_albedo=jnp.full(3, 0.3),
     )
+
+
+@pytest.fixture
+def check_jacobian():
+    """Compare forward and reverse derivatives with central differences; use it together with ``x64``.
+
+    ``check_jacobian(function, points, *rest)``: the derivative of ``function(x, *rest)`` in the vector ``x`` at each of
+    ``points``, relative to the largest entry of each column. ``rest`` are arguments, because what a compiled function
+    closes over is folded into constants, which can take minutes.
+    """
+
+    def check(function, points, *rest, step=1e-5, tolerance=1e-5):
+        def flat(x, *rest):
+            return jnp.ravel(function(x, *rest))
+
+        @eqx.filter_jit
+        def jacobians(x, *rest):
+            shifts = step * jnp.eye(x.size)
+            around = jax.lax.map(lambda shift: flat(x + shift, *rest), jnp.concatenate([shifts, -shifts]))
+            numeric = (around[: x.size] - around[x.size :]).T / (2 * step)
+            return numeric, jax.jacfwd(flat)(x, *rest), jax.jacrev(flat)(x, *rest)
+
+        for point in points:
+            numeric, forward, reverse = map(np.asarray, jacobians(jnp.asarray(point), *rest))
+            scale = np.abs(numeric).max(0)
+            # A column may vanish by symmetry; then it is compared with the others.
+            scale = np.maximum(scale, 1e-3 * scale.max())
+            np.testing.assert_allclose(forward / scale, numeric / scale, atol=tolerance)
+            np.testing.assert_allclose(reverse / scale, numeric / scale, atol=tolerance)
+
+    return check

@@ -98,9 +98,8 @@ def test_density_profiles():
 
 
 def test_optical_depths_of_the_earth_are_the_known_ones():
-    """τ_R(550 nm) is 0.097 (Bucholtz 1995, table 5) for the whole column; 13.558e-3 * 8 = 0.108 is Bruneton's choice."""
+    """β_R(550 nm) is 1.162e-2 /km at sea level (Bucholtz 1995, table 3); 13.558e-3 is Bruneton's choice."""
     assert float(earth().rayleigh_optical_depth[1]) == pytest.approx(0.10846, rel=1e-4)
-    spectral = earth([550.0])
-    assert float(spectral.rayleigh_optical_depth[0]) == pytest.approx(0.0972, rel=0.05)
+    assert float(earth([550.0]).rayleigh_scattering[0]) == pytest.approx(1.162e-2, rel=0.01)
     assert float(mars().mie_optical_depth[0]) == pytest.approx(0.5, rel=1e-6)
     assert float(mars().rayleigh_optical_depth[2]) < 0.02

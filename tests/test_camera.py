@@ -122,35 +122,23 @@ def test_pitch_and_yaw_point_the_axis():
     np.testing.assert_allclose(lens.directions()[1, 1], [*expected, np.sin(np.radians(40))], atol=1e-6)
 
 
-def check_jacobian(function, x, atol):
-    """Forward and reverse derivative against central differences, all in the precision of ``x`` (float64)."""
-    function = jax.jit(function)
-    step = 1e-6
-    shifts = step * np.eye(x.size).reshape(x.size, *x.shape)
-    numeric = np.stack([(function(x + d) - function(x - d)) / (2 * step) for d in shifts], -1)
-    for jacobian in (jax.jacfwd, jax.jacrev):
-        exact = np.asarray(jax.jit(jacobian(function))(x)).reshape(numeric.shape)
-        np.testing.assert_allclose(exact, numeric, atol=atol, rtol=1e-7)
-
-
 @pytest.mark.parametrize("kind", [Equirectangular, Fisheye, Pinhole])
-def test_directions_differentiate_in_every_angle(x64, kind):
+def test_directions_differentiate_in_every_angle(x64, check_jacobian, kind):
     names = [name for name in ("yaw", "pitch", "roll", "fov", "fov_y") if name in kind.__dataclass_fields__]
 
     def directions(angles):
         return kind(5, 7, **dict(zip(names, angles, strict=True))).directions()
 
     # An ordinary pose, and cameras that look straight up and down.
-    for pitch in (0.3, np.pi / 2, -np.pi / 2):
-        check_jacobian(directions, jnp.array([0.7, pitch, -0.3, 1.2][: len(names)]), atol=1e-8)
+    points = [[0.7, pitch, -0.3, 1.2][: len(names)] for pitch in (0.3, np.pi / 2, -np.pi / 2)]
+    check_jacobian(directions, points, tolerance=1e-8)
 
 
 @pytest.mark.parametrize("kind", [Equirectangular, Fisheye, Pinhole])
-def test_projection_differentiates(x64, kind):
+def test_projection_differentiates(x64, check_jacobian, kind):
     lens = kind(50, 70, yaw=0.7, pitch=0.2, roll=-0.3)
-    check_jacobian(
-        lambda v: lens.pixels(v), lens.directions_at(jnp.array([20.3, 40.0]), jnp.array([11.2, 30.0])), atol=1e-5
-    )
+    points = lens.directions_at(jnp.array([20.3, 40.0]), jnp.array([11.2, 30.0]))
+    check_jacobian(lambda v, lens: lens.pixels(v), points, lens)
 
 
 @pytest.mark.parametrize("kind", [Equirectangular, Fisheye, Pinhole])

@@ -4,7 +4,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.test_util import check_grads
 
 from diffatmo import color
 
@@ -40,10 +39,12 @@ def test_coarse_spectra_are_not_undersampled():
     def spectrum(wavelengths):
         return 1 + (wavelengths - 550) / 400
 
-    fine = spectrum(GRID) @ color.xyz_weights(GRID)
-    for step in (20.0, 47.0, 94.0):
-        coarse = jnp.arange(360.0, 831.0, step)
-        np.testing.assert_allclose(spectrum(coarse) @ color.xyz_weights(coarse), fine, rtol=1e-4)
+    fine, coarse = np.asarray(GRID), np.arange(360.0, 831.0, 94.0)
+    np.testing.assert_allclose(
+        spectrum(coarse) @ np.asarray(color.xyz_weights(jnp.asarray(coarse))),
+        spectrum(fine) @ np.asarray(color.xyz_weights(GRID)),
+        rtol=1e-4,
+    )
 
 
 def test_order_of_wavelengths_does_not_matter():
@@ -92,13 +93,10 @@ def test_auto_exposure_ignores_the_sun_and_survives_black():
     assert np.isfinite(jax.grad(lambda p: color.auto_exposure(p))(jnp.zeros((4, 4, 3)))).all()
 
 
-def test_display_differentiates(x64):
-    wavelengths = jnp.linspace(400.0, 700.0, 7)
-    radiance = jnp.linspace(0.2, 0.9, 7)
+def test_display_differentiates(x64, check_jacobian):
+    def shown(x):
+        return color.display(x[:7], wavelengths=jnp.linspace(400.0, 700.0, 7), exposure=x[7])
 
-    @jax.jit
-    def shown(radiance, exposure):
-        return color.display(radiance, wavelengths=wavelengths, exposure=exposure)
-
-    assert bool(jnp.all((shown(radiance, 0.7) > 0) & (shown(radiance, 0.7) < 1)))
-    check_grads(shown, (radiance, 0.7), order=1, rtol=1e-6)
+    point = jnp.linspace(0.2, 0.9, 8)
+    assert bool(jnp.all((shown(point) > 0) & (shown(point) < 1)))
+    check_jacobian(shown, [point])

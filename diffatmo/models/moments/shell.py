@@ -99,6 +99,20 @@ class Rays(eqx.Module):
         )
 
 
+class Links(eqx.Module):
+    """Rays with everything that takes moments at the nodes to the source along the rays."""
+
+    rays: Rays
+    altitude_rows: Float[Array, "i k n h"]
+    """Interpolation in altitude."""
+    sun_rows: Float[Array, "i k n s pj"]
+    """Interpolation in the sun's height, times ``dusk`` there."""
+    angular: Float[Array, "i k n lm pj"]
+    """Π_lm C_m in the direction of the ray."""
+    ground_rows: Float[Array, "i g s pj"]
+    """Interpolation of the ground's irradiance where the ray ends."""
+
+
 class Shell(eqx.Module):
     """All geometry of the iteration: a function of the planet's radii only, so a fit computes it once."""
 
@@ -106,11 +120,8 @@ class Shell(eqx.Module):
     mu_s: Float[Array, " j"]
     dusk: Float[Array, " j"]
     first: Rays
-    higher: Rays
-    altitude_rows: Float[Array, "i k n h"]
-    sun_rows: Float[Array, "i k n s pj"]
-    angular: Float[Array, "i k n lm pj"]
-    ground_rows: Float[Array, "i g s pj"]
+    iterate: Links
+    last: Links
     bottom_radius: Scalar
     top_altitude: Scalar
 
@@ -120,12 +131,11 @@ class Shell(eqx.Module):
 
     def altitude_unit(self, altitude: Altitude) -> Float[Array, "..."]:
         """Unit coordinate of an altitude, km."""
-        return table.unstretch(jnp.clip(altitude / self.top_altitude, 0, 1), ALTITUDE_LINEAR)
+        return altitude_unit(altitude, self.top_altitude)
 
     def sun_unit(self, mu_s: Cosine) -> Float[Array, "..."]:
         """Unit coordinate of a sun height; not below 0, where the sky is dark."""
-        low, high = sun_range(self.bottom_radius, self.top_altitude)
-        return jnp.maximum((jnp.arcsinh(mu_s / self.grazing()) - low) / (high - low), 0)
+        return sun_unit(mu_s, self.bottom_radius, self.top_altitude)
 
 
 def grazing(radius: Scalar, top: Altitude) -> Scalar:
@@ -141,6 +151,17 @@ def sun_range(radius: Scalar, top: Altitude) -> tuple[Scalar, Scalar]:
     return jnp.arcsinh(lowest / scale), jnp.arcsinh(0.985 / scale)
 
 
+def altitude_unit(altitude: Altitude, top: Altitude) -> Float[Array, "..."]:
+    """Unit coordinate of an altitude, km."""
+    return table.unstretch(jnp.clip(altitude / top, 0, 1), ALTITUDE_LINEAR)
+
+
+def sun_unit(mu_s: Cosine, radius: Scalar, top: Altitude) -> Float[Array, "..."]:
+    """Unit coordinate of a sun height; not below 0, where the sky is dark."""
+    low, high = sun_range(radius, top)
+    return jnp.maximum((jnp.arcsinh(mu_s / grazing(radius, top)) - low) / (high - low), 0)
+
+
 def dusk(mu_s: Cosine, scale: Scalar) -> Float[Array, "..."]:
     """How the light falls as the sun sinks, roughly: divided out of the moments before they are interpolated.
 
@@ -151,6 +172,36 @@ def dusk(mu_s: Cosine, scale: Scalar) -> Float[Array, "..."]:
     return jnp.exp(-depth * depth / (1 + depth / 4))
 
 
+def _link(
+    altitude: Float[Array, " i"],
+    mu_s: Float[Array, " j"],
+    radius: Scalar,
+    top: Altitude,
+    count: Directions,
+    degree: int,
+) -> Links:
+    """Rays, and the links that take moments of ``degree`` along them."""
+    r = Rays.build(altitude, mu_s, radius, top, count)
+    start = jnp.broadcast_to(altitude[:, None, None], r.nodes.altitude.shape)
+    mu_here = geometry.mu_along(start, r.mu[..., None], r.nodes.distance, radius)
+    nu = relative_nu(r.mu[..., None, None], mu_s, cosines(count.azimuths, altitude.dtype)[:, None])
+    here = jnp.broadcast_to(mu_here[..., None, None], r.mu_s_here.shape)
+    angular = azimuthal(degree, here, r.mu_s_here, nu[:, :, None]) * polar(degree, mu_here)[..., None, None, :]
+
+    def sun_rows(value: Cosine) -> Float[Array, "... s pj"]:
+        rows = table.cubic_rows(sun_unit(value, radius, top), mu_s.size)
+        rows = rows * dusk(value, grazing(radius, top))[..., None]
+        return jnp.swapaxes(rows.reshape(*value.shape[:-2], -1, mu_s.size), -1, -2)
+
+    return Links(
+        rays=r,
+        altitude_rows=table.cubic_rows(altitude_unit(r.nodes.altitude, top), altitude.size),
+        sun_rows=sun_rows(r.mu_s_here),
+        angular=jnp.swapaxes(angular.reshape(*angular.shape[:3], -1, angular.shape[-1]), -1, -2),
+        ground_rows=sun_rows(r.mu_s_ground),
+    )
+
+
 def build(
     bottom_radius: Scalar,
     top_altitude: Scalar,
@@ -158,37 +209,22 @@ def build(
     altitudes: int,
     suns: int,
     first: Directions,
-    higher: Directions,
-    degree: int,
+    iterate: Directions,
+    last: Directions,
 ) -> Shell:
-    """All geometry of a planet, with the ``higher`` orders iterated to ``degree``."""
+    """All geometry of a planet (radii and altitudes in km)."""
     altitude = top_altitude * table.stretch(jnp.linspace(0, 1, altitudes), ALTITUDE_LINEAR)
     low, high = sun_range(bottom_radius, top_altitude)
     scale = grazing(bottom_radius, top_altitude)
     mu_s = scale * jnp.sinh(jnp.linspace(0, 1, suns) * (high - low) + low)
-    once, again = (Rays.build(altitude, mu_s, bottom_radius, top_altitude, choice) for choice in (first, higher))
-    empty = jnp.zeros(0)
-    shell = Shell(
-        altitude, mu_s, dusk(mu_s, scale), once, again, empty, empty, empty, empty, bottom_radius, top_altitude
-    )
-    start = jnp.broadcast_to(altitude[:, None, None], again.nodes.altitude.shape)
-    mu_here = geometry.mu_along(start, again.mu[..., None], again.nodes.distance, bottom_radius)
-    nu = relative_nu(again.mu[..., None, None], mu_s, cosines(higher.azimuths, altitude.dtype)[:, None])
-    here = jnp.broadcast_to(mu_here[..., None, None], again.mu_s_here.shape)
-    angular = azimuthal(degree, here, again.mu_s_here, nu[:, :, None])
-    angular = angular * polar(degree, mu_here)[..., None, None, :]
-
-    def sun_rows(value: Cosine) -> Float[Array, "... s pj"]:
-        rows = table.cubic_rows(shell.sun_unit(value), suns) * dusk(value, scale)[..., None]
-        return jnp.swapaxes(rows.reshape(*value.shape[:-2], -1, suns), -1, -2)
-
-    return eqx.tree_at(
-        lambda s: (s.altitude_rows, s.sun_rows, s.angular, s.ground_rows),
-        shell,
-        (
-            table.cubic_rows(shell.altitude_unit(again.nodes.altitude), altitudes),
-            sun_rows(again.mu_s_here),
-            jnp.swapaxes(angular.reshape(*angular.shape[:3], -1, angular.shape[-1]), -1, -2),
-            sun_rows(again.mu_s_ground),
-        ),
+    planet = altitude, mu_s, bottom_radius, top_altitude
+    return Shell(
+        altitude=altitude,
+        mu_s=mu_s,
+        dusk=dusk(mu_s, scale),
+        first=Rays.build(*planet, first),
+        iterate=_link(*planet, iterate, iterate.degree),
+        last=_link(*planet, last, iterate.degree),
+        bottom_radius=bottom_radius,
+        top_altitude=top_altitude,
     )

@@ -14,7 +14,7 @@ from diffatmo.atmosphere import Atmosphere
 from diffatmo.models.base import Path, Ray, Sky, View
 from diffatmo.models.moments.angular import azimuthal, degrees, polar
 from diffatmo.models.moments.shell import Shell, dusk
-from diffatmo.models.moments.solve import State, source_moments
+from diffatmo.models.moments.solve import Degrees, State, source_moments
 from diffatmo.numerics import safe_divide, safe_sqrt
 
 ZENITH_WIDTH = 0.02
@@ -28,8 +28,7 @@ GROUND_LINEAR = 0.1
 class Resolution(NamedTuple):
     """Static sizes of the gather: degrees of the moments, nodes along a ray, and the tables of a view."""
 
-    first_degree: int
-    higher_degree: int
+    degrees: Degrees
     steps: int
     sky_rows: int
     ground_rows: int
@@ -86,7 +85,7 @@ class MomentsSky(Sky):
         position = self.shell.altitude_unit(nodes.altitude), self.shell.sun_unit(mu_s_here)
         moments = table.interpolate(by_position, *position).reshape(*mu_here.shape, count, w)
         moments = moments * dusk(mu_s_here, self.shell.grazing())[..., None, None]
-        degree = self.resolution.first_degree
+        degree = self.resolution.degrees.first
         angular = polar(degree, mu_here) * azimuthal(degree, mu_here, mu_s_here, nu[..., None])
         source = jnp.sum(moments * self._source(nodes.altitude) * angular[..., None], axis=-2)
         light = light + jnp.sum(self._survival(altitude, mu, nodes, steps) * source, axis=-2)
@@ -99,12 +98,12 @@ class MomentsSky(Sky):
 
     def _source(self, altitude: Altitude) -> Float[Array, "... lm w"]:
         """Scattering coefficient times phase moment of every (l, m), km^-1."""
-        degree = self.resolution.first_degree
+        degree = self.resolution.degrees.first
         return source_moments(self.atmosphere, altitude, degree)[..., degrees(degree), :]
 
     def aureole_phases(self, nu: Cosine) -> list[Float[Array, "..."]]:
         """Phase functions of repeated forward scattering beyond the kept moments, orders 2, 3, …"""
-        degrees = (self.resolution.first_degree, *[self.resolution.higher_degree] * (scattering.AUREOLE_ORDERS - 1))
+        degrees = (self.resolution.degrees.first, *[self.resolution.degrees.last] * (scattering.AUREOLE_ORDERS - 1))
         return [aureole_phase(self.atmosphere, nu, order, degree) for order, degree in enumerate(degrees, start=2)]
 
     def sun_irradiance(self, *, altitude: Altitude, mu_s: Cosine) -> Irradiance:
@@ -248,9 +247,9 @@ class MomentsView(View):
         sun_rows = table.cubic_rows(shell.sun_unit(mu_s_here), j) * dusk(mu_s_here, shell.grazing())[..., None]
         moments = jnp.einsum("rncj,rnxj->rncx", there.reshape(*nodes.altitude.shape, count * w, j), sun_rows)
         moments = moments.reshape(*nodes.altitude.shape, count, w, nu.shape[1])
-        angular = azimuthal(size.first_degree, mu_here, mu_s_here, nu[:, None])
+        angular = azimuthal(size.degrees.first, mu_here, mu_s_here, nu[:, None])
         weight = sky._source(nodes.altitude) * sky._survival(altitude, mu, nodes, size.steps)[..., None, :]
-        weight = weight * polar(size.first_degree, mu_here[..., 0])[..., None]
+        weight = weight * polar(size.degrees.first, mu_here[..., 0])[..., None]
         return jnp.einsum("rnlwx,rnlw,rnxl->rxw", moments, weight, angular)
 
     def _lookup(

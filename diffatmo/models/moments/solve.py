@@ -11,8 +11,16 @@ from diffatmo import geometry, phase, table, transmittance
 from diffatmo._types import Altitude, Scalar, Transmittance
 from diffatmo.atmosphere import Atmosphere
 from diffatmo.models.moments.angular import cosines, degrees, orders, pairs, relative_nu
-from diffatmo.models.moments.shell import Rays, Shell
+from diffatmo.models.moments.shell import Links, Rays, Shell
 from diffatmo.numerics import safe_divide
+
+
+class Degrees(NamedTuple):
+    """Degree to which the moments are kept: of single scattering, in the iteration, of all higher orders at its end."""
+
+    first: int
+    iterate: int
+    last: int
 
 
 class State(NamedTuple):
@@ -58,35 +66,34 @@ def _first_order(atmosphere: Atmosphere, shell: Shell, degree: int, peak_azimuth
     start = jnp.broadcast_to(shell.altitude[:, None], r.mu.shape)
     along, end = transmittance.columns_along(atmosphere, start, r.mu, nodes, r.steps)
     view = jnp.exp(-transmittance.optical_depth(atmosphere, along)) * nodes.weight[..., None]
-    # Two axes, the long one inside, and the wavelength outside: short inner axes would cost the vector units.
+    # Few axes, long inside, wavelengths outside: short inner axes would cost the vector units. The optical depth is a
+    # matrix product so that the columns are computed once, not once per wavelength.
     mu_s_here = r.mu_s_here.reshape(i * k * n, p * j)
     here = jnp.broadcast_to(nodes.altitude.reshape(-1, 1), mu_s_here.shape)
-    # The barrier keeps the compiler from computing the columns anew for every wavelength.
-    towards_sun, free = jax.lax.optimization_barrier(transmittance.to_top(atmosphere, here, mu_s_here))
-
-    def one_wavelength(air: Scalar, aerosol: Scalar, absorber: Scalar, view: Float[Array, "i k n"]) -> Array:
-        """Phase-free integrals ∫ ρ T ds of air and aerosol."""
-        depth = air * towards_sun.air + aerosol * towards_sun.aerosol + absorber * towards_sun.absorber
-        light = jnp.where(free, jnp.exp(-jnp.where(free, depth, 0)), 0).reshape(i, k, n, p * j)
-        return jnp.einsum("iknt,iknc->ikct", light, view[..., None] * density)
-
+    towards_sun, free = transmittance.to_top(atmosphere, here, mu_s_here)
+    columns = jnp.stack([jnp.where(free, column, 0) for column in towards_sun])
+    depth = jnp.einsum("cw,crt->wrt", transmittance.extinction(atmosphere), columns)
+    light = (jnp.exp(-depth) * free).reshape(-1, i, k, n, p * j)
     profiles = (atmosphere.rayleigh_density, atmosphere.mie_density)
-    density = jnp.stack([profile(nodes.altitude) for profile in profiles], axis=-1)
-    smooth = jax.vmap(one_wavelength, out_axes=2)(
-        atmosphere.rayleigh_scattering, atmosphere.mie_extinction, atmosphere.ozone_absorption, _leading(view)
-    ).reshape(i, k, -1, 2, p, j)
+    coefficients = (atmosphere.rayleigh_scattering, atmosphere.mie_scattering)
+    weight = jnp.stack(
+        [profile(nodes.altitude)[..., None] * view * c for profile, c in zip(profiles, coefficients, strict=True)]
+    )
+    smooth = jnp.einsum("wiknt,ciknw->wikct", light, weight).reshape(-1, p, j)
     # In azimuth the integrals are polynomials of low degree; the peak of the phase function needs many more azimuths.
     dtype = shell.altitude.dtype
     fine = cosines(peak_azimuths, dtype)
     to_fine = table.chebyshev(p, fine) @ jnp.asarray(table.chebyshev_coefficients(p), dtype)
-    nu = relative_nu(r.mu[..., None, None], shell.mu_s, fine[:, None])
+    smooth = jnp.einsum("fp,rpj->rfj", to_fine, smooth).reshape(-1, i * k, 2, fine.size * j)
+    nu = relative_nu(r.mu[..., None, None], shell.mu_s, fine[:, None]).reshape(i, k, fine.size * j)
     aerosol = phase.mie(nu, atmosphere.mie_g, atmosphere.mie_phase)
     # Normalised over the very nodes it is summed on: a peak between nodes loses no light.
-    norm = 2 * jnp.pi / fine.size * jnp.einsum("ikpj,ik->ij", aerosol, r.solid_angle)
-    phases = jnp.stack([phase.rayleigh(nu), aerosol / norm[:, None, None, :]])
-    scattering_ = jnp.stack([atmosphere.rayleigh_scattering, atmosphere.mie_scattering], axis=-1)[..., None, None]
-    smooth = jnp.einsum("ikwcpj,fp->ikwcfj", scattering_ * smooth, to_fine)
-    radiance = jnp.sum(smooth * jnp.moveaxis(phases, 0, 2)[:, :, None], axis=3)
+    total = jnp.einsum("ikt,ik->it", aerosol, r.solid_angle).reshape(i, fine.size, j)
+    norm = 2 * jnp.pi / fine.size * jnp.sum(total, axis=1)
+    aerosol = aerosol / jnp.tile(norm, (1, fine.size))[:, None]
+    phases = jnp.stack([phase.rayleigh(nu), aerosol], axis=2).reshape(i * k, 2, fine.size * j)
+    radiance = jnp.sum(smooth * phases, axis=2).reshape(-1, i, k, fine.size, j)
+    radiance = jnp.moveaxis(radiance, 0, 2)
     ground_level = jnp.zeros_like(r.mu_s_ground)
     sunlit = jnp.maximum(r.mu_s_ground, 0)[..., None] * transmittance.to_sun(atmosphere, ground_level, r.mu_s_ground)
     sky_count = k - r.mu_s_ground.shape[1]
@@ -98,40 +105,42 @@ def _first_order(atmosphere: Atmosphere, shell: Shell, degree: int, peak_azimuth
 
 
 class _Transport(eqx.Module):
-    """K: from the moments of one order of scattering to those of the next."""
+    """K: from the moments of one order of scattering to those of the next, over one set of links."""
 
     shell: Shell
+    links: Links
     albedo: Float[Array, " w"]
     weight: Float[Array, "i k n l w"]
     """T times (β_R χ^R_l + β_M χ^M_l) times the quadrature weight."""
-    survives: Transmittance
+    survives: Float[Array, "i g w"]
     degree: int = eqx.field(static=True)
 
     @classmethod
-    def build(cls, atmosphere: Atmosphere, shell: Shell, degree: int) -> "_Transport":
-        r = shell.higher
+    def build(cls, atmosphere: Atmosphere, shell: Shell, links: Links, degree: int) -> "_Transport":
+        """Prepare for moments of ``degree``."""
+        r = links.rays
         start = jnp.broadcast_to(shell.altitude[:, None], r.mu.shape)
         along, end = transmittance.columns_along(atmosphere, start, r.mu, r.nodes, r.steps)
         view = jnp.exp(-transmittance.optical_depth(atmosphere, along)) * r.nodes.weight[..., None]
         source = source_moments(atmosphere, r.nodes.altitude, degree)
         survives = jnp.exp(-transmittance.optical_depth(atmosphere, end))[:, r.mu.shape[1] - r.mu_s_ground.shape[1] :]
-        return cls(shell, atmosphere.ground_albedo, view[..., None, :] * source, survives, degree)
+        return cls(shell, links, atmosphere.ground_albedo, view[..., None, :] * source, survives, degree)
 
     def apply(self, state: State, degree: int) -> State:
         """The next order; its moments to ``degree``."""
-        shell, r = self.shell, self.shell.higher
+        links, r = self.links, self.links.rays
         i, count, w, j = state.moments.shape
         k, n, p = *r.nodes.altitude.shape[1:], r.azimuths
-        there = jnp.einsum("iknh,hc->iknc", shell.altitude_rows, state.moments.reshape(i, -1))
-        moments = jnp.einsum("ikncs,iknst->iknct", there.reshape(i, k, n, count * w, j), shell.sun_rows)
+        there = jnp.einsum("iknh,hc->iknc", links.altitude_rows, state.moments.reshape(i, -1))
+        moments = jnp.einsum("ikncs,iknst->iknct", there.reshape(i, k, n, count * w, j), links.sun_rows)
         moments = moments.reshape(i, k, n, count, w, p * j)
         weight = self.weight[:, :, :, degrees(self.degree), :, None]
-        radiance = jnp.sum(moments * shell.angular[:, :, :, :, None] * weight, axis=(2, 3))
-        falling = jnp.einsum("ws,igst->igwt", state.irradiance, shell.ground_rows)
+        radiance = jnp.sum(moments * links.angular[:, :, :, :, None] * weight, axis=(2, 3))
+        falling = jnp.einsum("ws,igst->igwt", state.irradiance, links.ground_rows)
         reflected = (self.albedo / jnp.pi * self.survives)[..., None] * falling
         radiance = radiance.at[:, k - reflected.shape[1] :].add(reflected)
-        radiance = radiance.reshape(i, k, w, p, j) / shell.dusk
-        cosine = cosines(p, shell.altitude.dtype)
+        radiance = radiance.reshape(i, k, w, p, j) / self.shell.dusk
+        cosine = cosines(p, self.shell.altitude.dtype)
         return State(_project(r, radiance, cosine, degree), _irradiance(r, radiance))
 
 
@@ -143,33 +152,26 @@ def source_moments(atmosphere: Atmosphere, altitude: Altitude, degree: int) -> F
     return densities[0][..., None, None] * air + densities[1][..., None, None] * aerosol
 
 
-def solve(
-    atmosphere: Atmosphere,
-    shell: Shell,
-    *,
-    orders_: int,
-    first_degree: int,
-    iteration_degree: int,
-    higher_degree: int,
-    peak_azimuths: int,
-) -> State:
-    """Moments of all scattered light, and the irradiance of the ground by the sky, both divided by ``dusk``."""
-    first = _first_order(atmosphere, shell, first_degree, peak_azimuths)
-    count = len(pairs(iteration_degree))
-    seed = State(first.moments[:, :count], first.irradiance)
-    transport = _Transport.build(atmosphere, shell, iteration_degree)
+def solve(atmosphere: Atmosphere, shell: Shell, *, order: int, degrees_: Degrees, peak_azimuths: int) -> State:
+    """Moments of all scattered light, and the irradiance of the ground by the sky, both divided by ``dusk``.
+
+    Orders of scattering up to ``order`` are computed one by one, the rest is a geometric tail.
+    """
+    first = _first_order(atmosphere, shell, degrees_.first, peak_azimuths)
+    seed = State(first.moments[:, : len(pairs(degrees_.iterate))], first.irradiance)
+    transport = _Transport.build(atmosphere, shell, shell.iterate, degrees_.iterate)
 
     def next_order(carry: tuple[State, State, State], _: None) -> tuple[tuple[State, State, State], None]:
         total, term, _previous = carry
-        following = transport.apply(term, iteration_degree)
+        following = transport.apply(term, degrees_.iterate)
         total = State(total.moments + following.moments, total.irradiance + following.irradiance)
         return (total, following, term), None
 
-    (total, term, previous), _ = jax.lax.scan(next_order, (seed, seed, seed), None, length=orders_ - 1)
+    (total, term, previous), _ = jax.lax.scan(next_order, (seed, seed, seed), None, length=order - 1)
     # Geometric tail: far along the series each order is the one before times a ratio, here that of the mean radiance.
     tail = _tail(term.moments[:, :1], previous.moments[:, :1])
     ground_tail = _tail(term.irradiance, previous.irradiance)
     total = State(total.moments + tail * term.moments, total.irradiance + ground_tail * term.irradiance)
-    beyond = transport.apply(total, higher_degree)
+    beyond = _Transport.build(atmosphere, shell, shell.last, degrees_.iterate).apply(total, degrees_.last)
     kept = beyond.moments.shape[1]
     return State(first.moments.at[:, :kept].add(beyond.moments), first.irradiance + beyond.irradiance)
