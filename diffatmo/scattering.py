@@ -54,20 +54,22 @@ def integrate(
         altitude[..., None], mu[..., None], mu_s[..., None], nu[..., None], nodes.distance, radius
     )
     towards_sun, free = transmittance.to_top(atmosphere, nodes.altitude, mu_s_here)
-    both = transmittance.Columns(*(a + b for a, b in zip(along, towards_sun, strict=True)))
-    free = free[..., None]
-    depth = jnp.where(free, transmittance.optical_depth(atmosphere, both), 0)
-    light = atmosphere.solar_irradiance * jnp.where(free, jnp.exp(-depth), 0)
-    air = light * (nodes.weight * atmosphere.rayleigh_density(nodes.altitude))[..., None]
-    aerosol = light * (nodes.weight * atmosphere.mie_density(nodes.altitude))[..., None]
-    repeated, term = [], aerosol
+    columns = jnp.stack([jnp.where(free, a + b, 0) for a, b in zip(along, towards_sun, strict=True)])
+    # A matrix product, wavelength outermost, so that the columns are computed once and not once per wavelength.
+    depth = jnp.tensordot(transmittance.extinction(atmosphere), columns, axes=(0, 0))
+    light = jnp.exp(-depth) * free
+    air = nodes.weight * atmosphere.rayleigh_density(nodes.altitude)
+    aerosol = nodes.weight * atmosphere.mie_density(nodes.altitude)
+    # τ^n / n! along the path to the sun, per power of the scattering coefficient.
+    powers = [aerosol]
     for order in range(1, aureole + 1):
-        term = term * jnp.where(free, towards_sun.aerosol[..., None], 0) * (atmosphere.mie_scattering / order)
-        repeated.append(atmosphere.mie_scattering * jnp.sum(term, axis=-2))
+        powers.append(powers[-1] * jnp.where(free, towards_sun.aerosol, 0) / order)
+    sums = jnp.einsum("w...n,c...n->...cw", light, jnp.stack([air, *powers])) * atmosphere.solar_irradiance
+    scattering = atmosphere.mie_scattering
     return Single(
-        rayleigh=atmosphere.rayleigh_scattering * jnp.sum(air, axis=-2),
-        mie=atmosphere.mie_scattering * jnp.sum(aerosol, axis=-2),
-        aureole=tuple(repeated),
+        rayleigh=atmosphere.rayleigh_scattering * sums[..., 0, :],
+        mie=scattering * sums[..., 1, :],
+        aureole=tuple(scattering ** (order + 1) * sums[..., order + 1, :] for order in range(1, aureole + 1)),
         transmittance=jnp.exp(-transmittance.optical_depth(atmosphere, end)),
     )
 

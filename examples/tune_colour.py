@@ -5,6 +5,7 @@
 
 import sys
 from dataclasses import replace
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,46 +19,60 @@ WANTED = {  # linear red, green, blue
     "zenith": (0.02, 0.08, 0.08),
     "horizon": (0.36, 0.28, 0.28),
 }
+VIEW_ZENITH_DEG = (0.0, 88.0)
+TUNED = ("rayleigh_scattering", "mie_absorption")
 RELUCTANCE = 0.02
 """How much a change of a coefficient by a factor e counts, next to a colour that is wrong by a factor e."""
-DIRECTIONS = jnp.stack([sun.direction(zenith=np.radians(angle), azimuth=0.0) for angle in (0.0, 88.0)])
-SUN = sun.direction(zenith=np.radians(70.0), azimuth=np.radians(40.0))
+
 ALTITUDE, EXPOSURE = 0.1, 5.0
-TUNED = ("rayleigh_scattering", "mie_absorption")
+SUN_ZENITH_DEG, SUN_AZIMUTH_DEG = 70.0, 40.0
 
 
-def atmosphere(logs: dict[str, jax.Array]) -> diffatmo.Atmosphere:
-    """Earth's air with other coefficients; their logarithms are free, so that they stay positive."""
-    return replace(diffatmo.earth(), **{name: jnp.exp(value) for name, value in logs.items()})
+class Task(NamedTuple):
+    """What is given. As an argument, not a constant, of what is compiled: XLA would compute with constants for minutes."""
+
+    air: diffatmo.Atmosphere
+    view: jax.Array
+    sun: jax.Array
+    wanted: jax.Array
 
 
-def colours(logs: dict[str, jax.Array]) -> jax.Array:
-    sky = diffatmo.Moments().sky(atmosphere(logs))
-    return EXPOSURE * sky.radiance(altitude=jnp.asarray(ALTITUDE), view=DIRECTIONS, sun=SUN).radiance
+def tuned(logs: dict[str, jax.Array], task: Task) -> diffatmo.Atmosphere:
+    """The air with other coefficients; their logarithms are free, so that they stay positive."""
+    return replace(task.air, **{name: jnp.exp(value) for name, value in logs.items()})
 
 
-def mismatch(logs: dict[str, jax.Array], target: tuple[jax.Array, dict[str, jax.Array]]) -> tuple:
-    wanted, start = target
-    return jnp.log(colours(logs) / wanted), jax.tree.map(lambda a, b: RELUCTANCE * (a - b), logs, start)
+def colours(logs: dict[str, jax.Array], task: Task) -> jax.Array:
+    sky = diffatmo.Moments().sky(tuned(logs, task))
+    return EXPOSURE * sky.radiance(altitude=ALTITUDE, view=task.view, sun=task.sun).radiance
+
+
+def mismatch(logs: dict[str, jax.Array], task: Task) -> tuple[jax.Array, dict[str, jax.Array]]:
+    change = {name: value - jnp.log(getattr(task.air, name)) for name, value in logs.items()}
+    return jnp.log(colours(logs, task) / task.wanted), jax.tree.map(lambda x: RELUCTANCE * x, change)
 
 
 def main(output: str = "teal_and_rose.png", size: str = "256") -> float:
-    wanted = jnp.array(list(WANTED.values()))
-    start = {name: jnp.log(getattr(diffatmo.earth(), name)) for name in TUNED}
-    solver = optx.LevenbergMarquardt(rtol=1e-3, atol=1e-3)
-    import time; t0=time.time()
-    solution = optx.least_squares(mismatch, solver, start, (wanted, start), max_steps=100, throw=False)
-    print(time.time()-t0, solution.stats["num_steps"], solution.result)
-    found = colours(solution.value)
-    for name, got, asked in zip(WANTED, found, wanted, strict=True):
-        print(f"{name:8} asked for {np.round(asked, 3)}, got {np.round(got, 3)}")
-    air = atmosphere(solution.value)
+    haze = replace(diffatmo.earth(), mie_absorption=jnp.full(3, 4e-3))
+    task = Task(
+        air=haze,
+        view=jnp.stack([sun.direction(zenith=np.radians(angle), azimuth=0.0) for angle in VIEW_ZENITH_DEG]),
+        sun=sun.direction(zenith=np.radians(SUN_ZENITH_DEG), azimuth=np.radians(SUN_AZIMUTH_DEG)),
+        wanted=jnp.array(list(WANTED.values())),
+    )
+    start = {name: jnp.log(getattr(haze, name)) for name in TUNED}
+    solver = optx.LevenbergMarquardt(rtol=1e-2, atol=1e-2)
+    solution = optx.least_squares(mismatch, solver, start, task, max_steps=50, throw=False)
+    air = tuned(solution.value, task)
+    found = mismatch(solution.value, task)[0]
+    for name, asked, error in zip(WANTED, task.wanted, found, strict=True):
+        print(f"{name:8} asked for {np.round(asked, 3)}, got {np.round(asked * np.exp(error), 3)}")
     print(diffatmo.atmosphere.dumps(air))
     camera = diffatmo.Pinhole(int(size) * 2 // 3, int(size), fov_y=np.radians(95.0), pitch=np.radians(45.0))
-    radiance = render.render(diffatmo.Scene(air, camera, ALTITUDE, SUN, EXPOSURE))
+    radiance = render.render(diffatmo.Scene(air, camera, ALTITUDE, task.sun, EXPOSURE))
     imageio.write_png(output, np.asarray(color.display(radiance, wavelengths=air.wavelengths)), overwrite=True)
     print(f"wrote {output}")
-    return float(jnp.max(jnp.abs(jnp.log(found / wanted))))
+    return float(jnp.max(jnp.abs(found)))
 
 
 if __name__ == "__main__":

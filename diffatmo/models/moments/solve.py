@@ -36,25 +36,21 @@ def _tail(last: Float[Array, "..."], previous: Float[Array, "..."]) -> Float[Arr
     return ratio / (1 - ratio)
 
 
-def _project(
-    rays_: Rays, radiance: Float[Array, "i k w p j"], cosine: Float[Array, " p"], degree: int
-) -> Float[Array, "i lm w j"]:
-    """Moments M_lm to ``degree`` of a radiance given at all direction nodes and at azimuths with the given cosines."""
+def _moments(r: Rays, by_order: Float[Array, "m i k w j"], degree: int) -> Float[Array, "i lm w j"]:
+    """Moments M_lm to ``degree`` from the azimuthal integrals ∫ L cos(m φ) dφ at every direction node."""
     count = len(pairs(degree))
-    harmonics = table.chebyshev(degree + 1, cosine) * (2 * jnp.pi / cosine.size)
-    by_order = jnp.einsum("ikwpj,pm->mikwj", radiance, harmonics)[orders(degree)]
-    moments = jnp.einsum("cikwj,ikc->icwj", by_order, rays_.project[..., :count])
-    return moments * rays_.sun_scale[:count, None]
+    moments = jnp.einsum("cikwj,ikc->icwj", by_order[orders(degree)], r.project[..., :count])
+    return moments * r.sun_scale[:count, None]
 
 
-def _irradiance(rays_: Rays, radiance: Float[Array, "i k w p j"]) -> Float[Array, "w j"]:
-    """Irradiance of the ground by the sky: the radiance at the lowest node from above its horizon, times mu."""
-    weight = jnp.where(rays_.ground, 0, rays_.solid_angle[0] * rays_.mu[0])
-    return 2 * jnp.pi * jnp.einsum("kwpj,k->wj", radiance[0], weight) / radiance.shape[3]
+def _irradiance(r: Rays, around: Float[Array, "i k w j"]) -> Float[Array, "w j"]:
+    """Irradiance of the ground by the sky: ∫ L dφ at the lowest node from above its horizon, times mu."""
+    return jnp.einsum("kwj,k->wj", around[0], jnp.where(r.ground, 0, r.solid_angle[0] * r.mu[0]))
 
 
-def _leading(spectral: Float[Array, "... w"]) -> Float[Array, "w ..."]:
-    return jnp.moveaxis(spectral, -1, 0)
+def _harmonics(degree: int, cosine: Float[Array, " p"]) -> Float[Array, "p m"]:
+    """Weights of ∫ … cos(m φ) dφ over the circle, at azimuths with the given cosines."""
+    return table.chebyshev(degree + 1, cosine) * (2 * jnp.pi / cosine.size)
 
 
 def _first_order(atmosphere: Atmosphere, shell: Shell, degree: int, peak_azimuths: int) -> State:
@@ -79,29 +75,30 @@ def _first_order(atmosphere: Atmosphere, shell: Shell, degree: int, peak_azimuth
     weight = jnp.stack(
         [profile(nodes.altitude)[..., None] * view * c for profile, c in zip(profiles, coefficients, strict=True)]
     )
-    smooth = jnp.einsum("wiknt,ciknw->wikct", light, weight).reshape(-1, p, j)
-    # In azimuth the integrals are polynomials of low degree; the peak of the phase function needs many more azimuths.
+    smooth = jnp.einsum("wiknt,ciknw->wikct", light, weight).reshape(-1, i, k, 2, p, j)
+    # In azimuth the integrals are polynomials of low degree; the peak of the phase function needs many more azimuths, but
+    # only its own integrals against those polynomials and cos(m φ).
     dtype = shell.altitude.dtype
     fine = cosines(peak_azimuths, dtype)
     to_fine = table.chebyshev(p, fine) @ jnp.asarray(table.chebyshev_coefficients(p), dtype)
-    smooth = jnp.einsum("fp,rpj->rfj", to_fine, smooth).reshape(-1, i * k, 2, fine.size * j)
-    nu = relative_nu(r.mu[..., None, None], shell.mu_s, fine[:, None]).reshape(i, k, fine.size * j)
+    harmonics = _harmonics(degree, fine)
+    products = (to_fine[:, :, None] * harmonics[:, None, :]).reshape(peak_azimuths, -1)
+    nu = relative_nu(r.mu[..., None, None], shell.mu_s[:, None], fine)
     aerosol = phase.mie(nu, atmosphere.mie_g, atmosphere.mie_phase)
     # Normalised over the very nodes it is summed on: a peak between nodes loses no light.
-    total = jnp.einsum("ikt,ik->it", aerosol, r.solid_angle).reshape(i, fine.size, j)
-    norm = 2 * jnp.pi / fine.size * jnp.sum(total, axis=1)
-    aerosol = aerosol / jnp.tile(norm, (1, fine.size))[:, None]
-    phases = jnp.stack([phase.rayleigh(nu), aerosol], axis=2).reshape(i * k, 2, fine.size * j)
-    radiance = jnp.sum(smooth * phases, axis=2).reshape(-1, i, k, fine.size, j)
-    radiance = jnp.moveaxis(radiance, 0, 2)
+    norm = jnp.einsum("ikj,ik->ij", aerosol @ harmonics[:, 0], r.solid_angle)
+    phases = jnp.stack([phase.rayleigh(nu), aerosol / norm[:, None, :, None]])
+    turned = (phases @ products).reshape(2, i, k, j, p, degree + 1)
+    by_order = jnp.einsum("cikjpm,wikcpj->mikwj", turned, smooth)
     ground_level = jnp.zeros_like(r.mu_s_ground)
     sunlit = jnp.maximum(r.mu_s_ground, 0)[..., None] * transmittance.to_sun(atmosphere, ground_level, r.mu_s_ground)
     sky_count = k - r.mu_s_ground.shape[1]
     survives = jnp.exp(-transmittance.optical_depth(atmosphere, end))[:, sky_count:, None, None, :]
-    reflected = jnp.einsum("igpjw,fp->igwfj", atmosphere.ground_albedo / jnp.pi * survives * sunlit, to_fine)
-    radiance = radiance.at[:, sky_count:].add(reflected)
-    radiance = radiance * (atmosphere.solar_irradiance[:, None, None] / shell.dusk)
-    return State(_project(r, radiance, fine, degree), _irradiance(r, radiance))
+    reflected = atmosphere.ground_albedo / jnp.pi * survives * sunlit
+    reflected = jnp.einsum("igpjw,pm->migwj", reflected, to_fine.T @ harmonics)
+    by_order = by_order.at[:, :, sky_count:].add(reflected)
+    by_order = by_order * (atmosphere.solar_irradiance[:, None] / shell.dusk)
+    return State(_moments(r, by_order, degree), _irradiance(r, by_order[0]))
 
 
 class _Transport(eqx.Module):
@@ -140,8 +137,9 @@ class _Transport(eqx.Module):
         reflected = (self.albedo / jnp.pi * self.survives)[..., None] * falling
         radiance = radiance.at[:, k - reflected.shape[1] :].add(reflected)
         radiance = radiance.reshape(i, k, w, p, j) / self.shell.dusk
-        cosine = cosines(p, self.shell.altitude.dtype)
-        return State(_project(r, radiance, cosine, degree), _irradiance(r, radiance))
+        harmonics = _harmonics(degree, cosines(p, radiance.dtype))
+        by_order = jnp.einsum("ikwpj,pm->mikwj", radiance, harmonics)
+        return State(_moments(r, by_order, degree), _irradiance(r, by_order[0]))
 
 
 def source_moments(atmosphere: Atmosphere, altitude: Altitude, degree: int) -> Float[Array, "... l w"]:
