@@ -20,10 +20,10 @@ from diffatmo.camera import Equirectangular
 from diffatmo.models import PathTrace
 from diffatmo.render import Scene
 
-HEIGHT, WIDTH = 32, 64
+HEIGHT, WIDTH = 48, 96
 ALTITUDE_KM = 0.1
 SUN_ZENITH_DEG = (35.0, 65.0, 82.0, 93.0)
-SAMPLES = 8192
+SAMPLES = 4096
 ELECTRONS = 10000.0
 """At the mean of a picture: photon noise of 1 %."""
 READ = 10.0

@@ -1,6 +1,6 @@
 """Photograph a sky three times, then recover the parameters of its atmosphere from the pictures.
 
-    python examples/recover_parameters.py
+python examples/recover_parameters.py
 """
 
 import sys
@@ -40,8 +40,8 @@ def main(width: str = "64") -> fitting.FitResult:
         init=start,
         free=["rayleigh_scattering", "mie_scattering", "mie_g"],
         progress=lambda step: print(f"step {step.step}: reduced χ² = {step.reduced_chi2:.4g}"),
-    )
-    Console().print(report.table(result, truth))
+    ).with_truth(truth)
+    Console().print(report.table(result))
     return result
 
 

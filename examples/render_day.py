@@ -1,6 +1,6 @@
 """Render a clear day from noon to twilight, seen by an all-sky camera, as one picture.
 
-    python examples/render_day.py day.png
+python examples/render_day.py day.png
 """
 
 import sys
@@ -13,10 +13,11 @@ from diffatmo import color, imageio, render, sun
 
 SUN_ZENITH_DEG = [10, 40, 65, 80, 87, 90, 93, 96]
 COLUMNS = 4
+WAVELENGTHS = np.linspace(420.0, 680.0, 7)  # enough for true colours, also those that ozone makes at twilight
 
 
 def main(output: str = "day.png", size: str = "192") -> None:
-    air = diffatmo.earth()
+    air = diffatmo.earth(WAVELENGTHS)
     pictures = []
     for zenith in SUN_ZENITH_DEG:
         scene = diffatmo.Scene(

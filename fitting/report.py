@@ -374,7 +374,7 @@ def developed(
     exposure = color.auto_exposure(color.to_linear_srgb(used, wavelengths=bands))
 
     def develop(image: Image) -> Float[np.ndarray, "height width 3"]:
-        known = np.isfinite(image).all(axis=-1, keepdims=True)
+        known = observation.shown[..., None] & np.isfinite(image).all(axis=-1, keepdims=True)
         rgb = color.display(jnp.asarray(np.where(known, image, 0)), wavelengths=bands, exposure=exposure)
         return np.where(known, rgb, _MASKED)
 

@@ -47,7 +47,13 @@ FIRST_PASS_TOLERANCE = 1.0
 ROUNDING_DISTANCE = 0.3
 """Distance below which rejected steps mean that rounding hides the last of the way."""
 
-REJECTIONS_AT_ROUNDING, REJECTIONS_AT_MOST = 3, 20
+REJECTIONS_AT_ROUNDING = 3
+
+REJECTIONS_AT_MOST = 11
+"""Each makes the damping four times as large; after as many no step is left in float32."""
+
+LONGEST_STEP = 3.0
+"""In natural units: what the derivatives say of a parameter e³ times as large is not worth an evaluation."""
 
 INTERRUPTED = "interrupted by the user"
 OUT_OF_STEPS = "stopped: not converged in the steps allowed"
@@ -154,6 +160,12 @@ def _hold(
     return np.where(np.append(held, False), 0, factor)
 
 
+def _shorten(y: Coordinates, trial: Coordinates, limits: tuple[np.ndarray, np.ndarray]) -> Coordinates:
+    """``trial``, pulled towards ``y`` until no coordinate changes by more than is sensible, and inside the limits."""
+    largest = jnp.max(jnp.abs(trial - y))
+    return jnp.clip(y + (trial - y) * jnp.minimum(1, LONGEST_STEP / jnp.where(largest > 0, largest, 1)), *limits)
+
+
 class _Point(NamedTuple):
     """A point of the search, and why the search ended if it ended there."""
 
@@ -183,11 +195,11 @@ def _minimise(
     freedom = max(_count(problem.batch) - y.size, 1)
     stage = history[-1].stage + 1 if history else 1
     best: _Point | None = None
-    misfit, rejections = 1.0, 0
+    misfit, scale, rejections = 1.0, 1.0, 0
     try:
         while best is None or len(history) < max_steps:
             started = time.perf_counter()
-            trial = jnp.clip(state.y_eval, *limits)
+            trial = _shorten(y, state.y_eval, limits)
             linearisation = start if best is None else evaluate(trial, problem)
             factor = np.asarray(_reduce(trial, linearisation, problem), dtype=np.float64)
             finite = bool(np.all(np.isfinite(factor)))
@@ -197,14 +209,16 @@ def _minimise(
                 # An infinitely bad point, in numbers whose squares do not overflow: the step is rejected and shortened.
                 chi2, held = math.inf, np.diag([0.0] * y.size + [1e15])
             step_size = state.search_state.step_size
-            if best is None or chi2 < best.chi2:
+            if best is None:
+                misfit = scale = max(1.0, chi2 / freedom)
+            elif chi2 < best.chi2:
                 # The damping follows the misfit: with λ = 1 a step is restrained to about a natural unit in directions
                 # that the data, given residuals of the present size, determine no better than that.
                 previous, misfit = misfit, max(1.0, chi2 / freedom)
                 step_size = step_size * (previous / misfit)
             state = eqx.tree_at(lambda s: (s.y_eval, s.search_state.step_size), state, (trial, step_size))
             change = float(jnp.max(jnp.abs(trial - y)))
-            plane = jnp.asarray(held, dtype=y.dtype)
+            plane = jnp.asarray(held / math.sqrt(scale), dtype=y.dtype)
             y, state = _step(y, state, (plane[:, -1], plane[:, :-1], trial))
             accepted = best is None or (finite and bool(jnp.all(y == trial)))
             if best is None or accepted:
@@ -219,12 +233,14 @@ def _minimise(
                     accepted=accepted,
                     change=change,
                     distance=best.distance,
-                    damping=1 / max(float(state.search_state.step_size), 1e-30),
+                    damping=scale / max(float(state.search_state.step_size), 1e-30),
                     seconds=time.perf_counter() - started,
                 )
             )
             if progress is not None:
                 progress(history[-1])
+            if bool(jnp.all(_shorten(y, state.y_eval, limits) == y)):
+                rejections = REJECTIONS_AT_MOST
             end = _end(best.distance, rejections, tolerance)
             if end is not None:
                 return best._replace(converged=end[0], message=end[1])

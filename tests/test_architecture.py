@@ -19,14 +19,19 @@ ROOT = Path(__file__).parent.parent
 LEVELS = [
     ["diffatmo._types", "diffatmo.constants"],
     ["diffatmo.numerics"],
-    [f"diffatmo.{name}" for name in ("geometry", "phase", "table", "spectrum", "color", "camera", "sun")],
+    [f"diffatmo.{name}" for name in ("geometry", "phase", "table", "spectrum", "color", "codecs", "camera", "sun")],
     ["diffatmo.rays", "diffatmo.atmosphere"],
     ["diffatmo.transmittance"],
     ["diffatmo.scattering"],
     ["diffatmo.models.base"],
+    [f"diffatmo.models.{name}" for name in ("moments.angular", "pathtrace.columns", "pathtrace.lattice")],
+    ["diffatmo.models.moments.shell", "diffatmo.models.pathtrace.vector", "diffatmo.models.pathtrace.guide"],
+    ["diffatmo.models.moments.solve", "diffatmo.models.pathtrace.paths"],
+    ["diffatmo.models.moments.sky"],
     ["diffatmo.models.raymarch", "diffatmo.models.moments", "diffatmo.models.pathtrace"],
     ["diffatmo.models"],
     ["diffatmo.render", "diffatmo.imageio"],
+    ["diffatmo.scene"],
     ["fitting._errors"],
     ["fitting.parameters", "fitting.observation"],
     ["fitting.residuals"],
@@ -85,6 +90,17 @@ def test_imports_point_down(module):
 def test_only_the_command_line_sees_fitting(module):
     if not module.startswith("diffatmo.cli"):
         assert not {name for name in imports(MODULES[module]) if name.startswith("fitting")}
+
+
+def model(module: str) -> str | None:
+    """The model a module belongs to."""
+    parts = module.split(".")
+    return parts[2] if parts[:2] == ["diffatmo", "models"] and len(parts) > 2 and parts[2] != "base" else None
+
+
+@pytest.mark.parametrize("module", [name for name in MODULES if model(name)])
+def test_models_do_not_import_each_other(module):
+    assert {model(name) for name in imports(MODULES[module])} <= {None, model(module)}
 
 
 def test_public_names_resolve():

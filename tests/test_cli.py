@@ -118,7 +118,7 @@ def test_radiance_in_double_precision(tmp_path, atm, toy):
 
 def test_radiance_names_wavelengths_with_as_few_digits_as_possible():
     air = atmosphere.earth([680.0, 550.55])
-    assert radiance_command.new_columns(air) == [
+    assert radiance_command.new_columns(air, models.Moments()) == [
         "radiance_680",
         "radiance_550.55",
         "transmittance_680",

@@ -2,7 +2,7 @@
 
 import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -18,13 +18,27 @@ class InputError(ValueError):
     """Something the user gave is wrong; the message says what, and what would be right."""
 
 
-model_option = click.option(
-    "--model",
-    type=click.Choice(MODELS),
-    default=MODELS[0],
-    show_default=True,
-    help="moments: all orders of scattering; raymarch: single scattering; pathtrace: Monte Carlo.",
-)
+def model_options(command: Any) -> Any:
+    """Add the options that :func:`make_model` takes."""
+    for option in reversed(
+        (
+            click.option(
+                "--model",
+                type=click.Choice(MODELS),
+                default=MODELS[0],
+                show_default=True,
+                help="moments: all orders of scattering; raymarch: single scattering; pathtrace: Monte Carlo.",
+            ),
+            click.option("--samples", type=click.IntRange(min=32), help="Paths per ray of pathtrace.  [default: 4096]"),
+            click.option(
+                "--seed", type=click.IntRange(min=0), help="Of the random numbers of pathtrace.  [default: 0]"
+            ),
+        )
+    ):
+        command = option(command)
+    return command
+
+
 overwrite_option = click.option("--overwrite", is_flag=True, help="Replace files that exist.")
 
 
@@ -59,8 +73,11 @@ def check_writable(directory: Path) -> None:
         raise InputError(f"{directory}: cannot be written to: {error.strerror}") from error
 
 
-def make_model(name: str) -> "Model":
-    """The model called ``name``, at its default resolution."""
+def make_model(name: str, *, samples: int | None = None, seed: int | None = None) -> "Model":
+    """The model called ``name``, at its default resolution; ``samples`` and ``seed`` are the path tracer's alone."""
     from diffatmo import models
 
-    return models.MODELS[name]()
+    chosen = {key: value for key, value in {"samples": samples, "seed": seed}.items() if value is not None}
+    if chosen and name != "pathtrace":
+        raise InputError(f"--{next(iter(chosen))} contradicts --model {name}: it belongs to pathtrace")
+    return models.MODELS[name](**chosen)

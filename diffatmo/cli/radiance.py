@@ -8,14 +8,15 @@ from typing import TYPE_CHECKING
 
 import click
 
-from diffatmo.cli.common import InputError, check_output, make_model, model_option, overwrite_option, read_atmosphere
+from diffatmo.cli.common import InputError, check_output, make_model, model_options, overwrite_option, read_atmosphere
 from diffatmo.cli.keys import Number
 
 if TYPE_CHECKING:
     import numpy as np
+    from jax import Array
 
     from diffatmo.atmosphere import Atmosphere
-    from diffatmo.models import Model
+    from diffatmo.models import Model, Sky
 
 COLUMNS = {
     "altitude_km": Number("Height above the ground.", 0),
@@ -44,10 +45,19 @@ class Table:
 @click.option(
     "-o", "--output", metavar="OUT.csv", type=click.Path(path_type=Path), required=True, help="File to write."
 )
-@model_option
+@model_options
 @click.option("--x64", is_flag=True, help="Compute in double precision.")
 @overwrite_option
-def radiance(atmosphere: str, directions: Path, output: Path, model: str, x64: bool, overwrite: bool) -> None:
+def radiance(
+    atmosphere: str,
+    directions: Path,
+    output: Path,
+    model: str,
+    samples: int | None,
+    seed: int | None,
+    x64: bool,
+    overwrite: bool,
+) -> None:
     """Radiance along a table of directions.
 
     ATM.toml is an atmosphere file or the name of a preset. DIRECTIONS.csv has the columns altitude_km, sun_zenith_deg,
@@ -63,11 +73,12 @@ def radiance(atmosphere: str, directions: Path, output: Path, model: str, x64: b
         if x64:
             stack.enter_context(jax.enable_x64(True))
         air = read_atmosphere(atmosphere)
-        columns = new_columns(air)
+        chosen = make_model(model, samples=samples, seed=seed)
+        columns = new_columns(air, chosen)
         taken = [name for name in columns if name in table.header]
         if taken:
             raise InputError(f"{directions}: has a column {taken[0]} already")
-        values = compute(air, table, make_model(model))
+        values = compute(air, table, chosen)
     write_table(output, table, columns, values)
 
 
@@ -117,25 +128,43 @@ def compute(atmosphere: "Atmosphere", table: Table, model: "Model") -> list[list
     sun = _direction(degrees[0], np.zeros_like(degrees[0]))
     view = _direction(degrees[1], degrees[2])
 
-    # One shape, and so one compilation, serves every chunk; the last one repeats its last row.
-    size = min(CHUNK, 1 << (len(table.rows) - 1).bit_length())
+    # One shape, and so one compilation, serves every chunk; the last one is filled up with its last row.
+    count = len(table.rows)
+    chunks = -(-count // CHUNK)
+    size = -(-count // chunks)
     sky = eqx.filter_jit(model.sky)(atmosphere)
-    answer = eqx.filter_jit(lambda sky, rays: sky.radiance(altitude=rays[0], view=rays[1], sun=rays[2]))
+    ask = eqx.filter_jit(_ask)
     parts = []
-    for start in range(0, len(table.rows), size):
-        rows = np.minimum(np.arange(start, start + size), len(table.rows) - 1)
+    for number in range(chunks):
+        rows = np.minimum(np.arange(number * size, (number + 1) * size), count - 1)
         rays = [jnp.asarray(array[rows], jnp.result_type(float)) for array in (altitude, view, sun)]
-        parts.append(jax.device_get(answer(sky, rays)))
-    values = np.concatenate([np.concatenate(part, axis=-1) for part in parts])[: len(table.rows)]
+        parts.append(jax.device_get(ask(sky, jnp.asarray(number), *rays)))
+    values = np.concatenate([np.concatenate(part, axis=-1) for part in parts])[:count]
     return [[str(number) for number in row] for row in values]
 
 
-def new_columns(atmosphere: "Atmosphere") -> list[str]:
+def _ask(sky: "Sky", chunk: "Array", altitude: "Array", view: "Array", sun: "Array") -> "tuple[Array, ...]":
+    """Radiance, transmittance and, for the path tracer, standard error along rays."""
+    import jax
+
+    from diffatmo.models.pathtrace import PathTraceSky
+
+    if not isinstance(sky, PathTraceSky):
+        return sky.radiance(altitude=altitude, view=view, sun=sun)
+    # Chunks must not share random numbers, or their errors would be the same.
+    key = jax.random.fold_in(sky.key, chunk)
+    light, error, transmittance = sky.radiance_with_error(altitude=altitude, view=view, sun=sun, key=key)
+    return light, transmittance, error
+
+
+def new_columns(atmosphere: "Atmosphere", model: "Model") -> list[str]:
     """Names of the columns to add."""
     from diffatmo.atmosphere import to_dict
+    from diffatmo.models import PathTrace
 
+    quantities = ["radiance", "transmittance"] + ["stderr"] * isinstance(model, PathTrace)
     names = [label(wavelength) for wavelength in to_dict(atmosphere)["wavelengths_nm"]]
-    return [f"{quantity}_{name}" for quantity in ("radiance", "transmittance") for name in names]
+    return [f"{quantity}_{name}" for quantity in quantities for name in names]
 
 
 def label(wavelength: float) -> str:

@@ -12,7 +12,7 @@ from diffatmo.cli.common import (
     InputError,
     check_output,
     make_model,
-    model_option,
+    model_options,
     overwrite_option,
     read_atmosphere,
 )
@@ -43,7 +43,7 @@ SIZE = click.IntRange(1, 16384)
     required=True,
     help="File to write, .exr or .png; may be given more than once.",
 )
-@model_option
+@model_options
 @click.option("--width", type=SIZE, help="Pixels across.  [default: 512]")
 @click.option("--height", type=SIZE, help="Pixels down.  [default: by the projection]")
 @keys.options(CAMERA_KEYS, DEFAULTS)
@@ -55,6 +55,8 @@ def render(
     atmosphere: str,
     outputs: tuple[Path, ...],
     model: str,
+    samples: int | None,
+    seed: int | None,
     width: int | None,
     height: int | None,
     sun_disc: bool,
@@ -76,6 +78,7 @@ def render(
 
     from diffatmo import render, sun
 
+    chosen = make_model(model, samples=samples, seed=seed)
     air = read_atmosphere(atmosphere)
     width, height = picture_size(options, width, height)
     camera = keys.make_camera({k: v for k, v in options.items() if k in CAMERA_KEYS}, height=height, width=width)
@@ -88,7 +91,7 @@ def render(
         ),
         exposure=options.get("exposure", 1.0),
     )
-    pixels = np.asarray(render.render(scene, make_model(model), sun_disc=sun_disc))
+    pixels = np.asarray(render.render(scene, chosen, sun_disc=sun_disc))
     for path, write in writers:
         write(path, pixels, scene, {"model": model, "sun_disc": sun_disc}, "exposure" not in given)
 

@@ -2,9 +2,10 @@
 
 from diffatmo.models.base import Model, Path, Ray, Sky, View
 from diffatmo.models.moments import Moments
+from diffatmo.models.pathtrace import PathTrace
 from diffatmo.models.raymarch import RayMarch
 
-MODELS: dict[str, type[Model]] = {"moments": Moments, "raymarch": RayMarch}
+MODELS: dict[str, type[Model]] = {"moments": Moments, "raymarch": RayMarch, "pathtrace": PathTrace}
 """Models by the name the command line takes."""
 
-__all__ = ["MODELS", "Model", "Moments", "Path", "Ray", "RayMarch", "Sky", "View"]
+__all__ = ["MODELS", "Model", "Moments", "Path", "PathTrace", "Ray", "RayMarch", "Sky", "View"]

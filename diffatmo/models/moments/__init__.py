@@ -34,11 +34,11 @@ __all__ = ["Moments", "MomentsSky", "MomentsView", "Shell"]
 class Moments(Model):
     """The default model. Fields are resolutions; the defaults keep the sky within about 0.1 % of Monte Carlo."""
 
-    altitudes: int = 14
-    suns: int = 26
-    first: Directions = Directions(sky=12, ground=5, azimuths=5, steps=5, degree=8)
-    iterate: Directions = Directions(sky=8, ground=5, azimuths=3, steps=4, degree=2)
-    last: Directions = Directions(sky=8, ground=5, azimuths=6, steps=4, degree=5)
+    altitudes: int = 12
+    suns: int = 24
+    first: Directions = Directions(sky=14, ground=6, azimuths=5, steps=5, degree=8)
+    iterate: Directions = Directions(sky=6, ground=4, azimuths=3, steps=3, degree=2)
+    last: Directions = Directions(sky=6, ground=4, azimuths=7, steps=4, degree=6)
     peak_azimuths: int = 32
     order: int = 5
     view_steps: int = 8

@@ -1,0 +1,229 @@
+"""Volumetric Monte Carlo: the truth that the other models are measured against.
+
+Backward path tracing through the spherical shell with Rayleigh and aerosol scattering, absorption and a Lambertian ground,
+any number of orders, no approximation but the geometry all models share. An answer comes with its standard error, and any
+number of samples brings it down without a floor: optical depths are integrated from the densities with a systematic error
+of some 1e-5 (:mod:`.columns`), and everything rough in here decides only where samples go.
+
+- :mod:`.paths`: the random walk and its weights;
+- :mod:`.guide`: a rough solution of the sky that tells paths where to go, from noon into deep twilight;
+- :mod:`.lattice`: random numbers that fill space evenly;
+- :mod:`.columns`: optical depths along a ray.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from diffatmo import geometry
+from diffatmo._types import Altitude, Cosine, Direction, Irradiance, Length, Radiance, Transmittance
+from diffatmo.atmosphere import Atmosphere
+from diffatmo.models.base import Model, Path, Ray, Sky
+from diffatmo.models.pathtrace import columns, guide
+from diffatmo.models.pathtrace.guide import Guide
+from diffatmo.models.pathtrace.paths import Rays, trace
+from diffatmo.numerics import safe_divide
+
+__all__ = ["PathTrace", "PathTraceSky"]
+
+FINE = 64
+"""Panels for what is integrated once and handed out: the transmittance of the ray, the sun's irradiance."""
+
+
+@jax.custom_jvp
+def _refuse_derivatives(atmosphere: Atmosphere) -> Atmosphere:
+    return atmosphere
+
+
+@_refuse_derivatives.defjvp
+def _refuse(primals: Any, tangents: Any) -> Any:
+    raise NotImplementedError(
+        "pathtrace: the derivative of a Monte Carlo estimate is not an estimate of the derivative, because paths jump "
+        "when parameters move; differentiate moments or raymarch instead"
+    )
+
+
+class Resolution(NamedTuple):
+    """What is fixed when the walk is compiled; the seed is not."""
+
+    samples: int
+    replicates: int
+    lanes: int
+    panels: int
+
+
+class PathTrace(Model):
+    """Monte Carlo with ``samples`` paths per ray, all wavelengths on the same paths.
+
+    ``samples`` is rounded up to ``replicates`` times a power of two; the standard error comes from that many independent
+    replicates. ``lanes`` paths are computed side by side, which bounds the memory. ``panels`` resolve the atmosphere
+    along a ray; 12 suit exponentials and layers some kilometres thick.
+    """
+
+    samples: int = 4096
+    seed: int = 0
+    replicates: int = 32
+    lanes: int = 8192
+    panels: int = 12
+
+    def sky(self, atmosphere: Atmosphere) -> "PathTraceSky":
+        """Prepare the guide; the paths are traced when the sky is asked."""
+        atmosphere = _refuse_derivatives(atmosphere)
+        resolution = Resolution(self.samples, self.replicates, self.lanes, self.panels)
+        return PathTraceSky(atmosphere, guide.build(atmosphere), jax.random.key(self.seed), resolution)
+
+
+class PathTraceSky(Sky):
+    """A sky that answers by tracing paths. The same question gets the same answer; another ``key`` another sample."""
+
+    atmosphere: Atmosphere
+    guide: Guide
+    key: PRNGKeyArray
+    resolution: Resolution = eqx.field(static=True)
+
+    def radiance_with_error(
+        self, *, altitude: Altitude, view: Direction, sun: Direction, key: PRNGKeyArray | None = None
+    ) -> tuple[Radiance, Radiance, Transmittance]:
+        """Radiance, its standard error and the transmittance; arguments as for :meth:`radiance`."""
+        key = self.key if key is None else key
+        return _ask(self, altitude, view, sun, jnp.inf, key, ground=True)
+
+    def radiance(self, *, altitude: Altitude, view: Direction, sun: Direction) -> Ray:
+        """Radiance and transmittance along unit vectors ``view`` for a sun in direction ``sun``, shapes (..., 3)."""
+        light, _, transmittance = self.radiance_with_error(altitude=altitude, view=view, sun=sun)
+        return Ray(light, transmittance)
+
+    def path(self, *, altitude: Altitude, mu: Cosine, mu_s: Cosine, nu: Cosine, distance: Length | None = None) -> Path:
+        """Inscattered radiance and transmittance to the boundary, or to ``distance`` km if that is nearer."""
+        altitude, mu, mu_s, nu = jnp.broadcast_arrays(altitude, mu, mu_s, nu)
+        sine = geometry.sine(mu)
+        view = jnp.stack([jnp.zeros_like(mu), sine, mu], axis=-1)
+        # The sun's component along the view's horizontal direction, and what is left of its length.
+        along = jnp.clip(safe_divide(nu - mu * mu_s, sine), -geometry.sine(mu_s), geometry.sine(mu_s))
+        across = jnp.sqrt(jnp.maximum((1 - mu_s) * (1 + mu_s) - along * along, 0))
+        sun = jnp.stack([across, along, mu_s], axis=-1)
+        reach = jnp.inf if distance is None else distance
+        light, _, transmittance = _ask(self, altitude, view, sun, reach, jax.random.fold_in(self.key, 1), ground=False)
+        return Path(light, transmittance)
+
+    @eqx.filter_jit
+    def sun_irradiance(self, *, altitude: Altitude, mu_s: Cosine) -> Irradiance:
+        """Direct irradiance of the sun on a horizontal plane."""
+        altitude, mu_s = jnp.broadcast_arrays(altitude, mu_s)
+        radius, top = self.atmosphere.bottom_radius, self.atmosphere.top_altitude
+        inside, mu, _, _, misses = geometry.enter_atmosphere(altitude, mu_s, mu_s, jnp.ones_like(mu_s), radius, top)
+        to_sun = columns.to_top(self.atmosphere, inside, mu, jnp.full((), 0.5, mu.dtype), FINE)
+        to_sun = jnp.where(misses[..., None], 1, jnp.moveaxis(to_sun, 0, -1))
+        return jnp.maximum(mu_s, 0)[..., None] * self.atmosphere.solar_irradiance * to_sun
+
+    def sky_irradiance(self, *, mu_s: Cosine) -> Irradiance:
+        """Diffuse irradiance of the sky on the ground."""
+        zero = jnp.zeros_like(mu_s)
+        up = jnp.stack([zero, zero, zero + 1], axis=-1)
+        sun = jnp.stack([zero, geometry.sine(mu_s), mu_s], axis=-1)
+        key = jax.random.fold_in(self.key, 2)
+        return _ask(self, zero, up, sun, jnp.inf, key, ground=True, hemisphere=True)[0]
+
+
+@eqx.filter_jit
+def _ask(
+    sky: PathTraceSky,
+    altitude: Altitude,
+    view: Direction,
+    sun: Direction,
+    reach: Length,
+    key: PRNGKeyArray,
+    *,
+    ground: bool,
+    hemisphere: bool = False,
+) -> tuple[Radiance, Radiance, Transmittance]:
+    """Estimate, standard error and transmittance for a batch of rays of any shape, from anywhere."""
+    atmosphere = sky.atmosphere
+    dtype = atmosphere.bottom_radius.dtype
+    altitude, reach, *components = jnp.broadcast_arrays(
+        *(jnp.asarray(x, dtype) for x in (altitude, reach)), *jnp.moveaxis(jnp.asarray(view, dtype), -1, 0),
+        *jnp.moveaxis(jnp.asarray(sun, dtype), -1, 0)
+    )  # fmt: skip
+    shape = altitude.shape
+    rays = _enter(atmosphere, altitude.ravel(), [x.ravel() for x in components], reach.ravel(), ground)
+    mean, error = _average(sky, rays, key, hemisphere)
+    through = jnp.moveaxis(_transmittance(atmosphere, rays), 0, -1)
+    width = atmosphere.wavelengths.size
+    return mean.reshape(*shape, width), error.reshape(*shape, width), through.reshape(*shape, width)
+
+
+def _enter(atmosphere: Atmosphere, altitude: Altitude, components: list[Array], reach: Length, ground: bool) -> Rays:
+    """Rays that start inside the atmosphere; one that misses it starts at the top and leaves at once."""
+    radius, top = atmosphere.bottom_radius, atmosphere.top_altitude
+    x, y, z = components[:3]
+    sun = (components[3], components[4], components[5])
+    nu = x * sun[0] + y * sun[1] + z * sun[2]
+    inside, _, _, moved, misses = geometry.enter_atmosphere(altitude, z, sun[2], nu, radius, top)
+    r, r_inside = radius + altitude, radius + inside
+    up = (moved * x / r_inside, moved * y / r_inside, (r + moved * z) / r_inside)
+    up = tuple(jnp.where(misses, pole, part) for pole, part in zip((0.0, 0.0, 1.0), up, strict=True))
+    view = tuple(jnp.where(misses, pole, part) for pole, part in zip(up, (x, y, z), strict=True))
+    return Rays(inside, up, view, sun, jnp.maximum(reach - moved, 0), jnp.full(altitude.shape, ground))
+
+
+def _transmittance(atmosphere: Atmosphere, rays: Rays) -> Float[Array, "w rays"]:
+    """To the end of each ray, or as far as it reaches."""
+    mu = rays.up[0] * rays.view[0] + rays.up[1] * rays.view[1] + rays.up[2] * rays.view[2]
+    mu = jnp.clip(mu, -1, 1)
+    ray = columns.segment(atmosphere, rays.altitude, mu, geometry.hits_ground(rays.altitude, mu, atmosphere.bottom_radius))
+    end = jnp.minimum(rays.reach, ray.length)
+    half = jnp.full((), 0.5, mu.dtype)
+    whole, _ = columns.walk(atmosphere, ray, end, half, FINE, lambda carry, _: (carry, None), None)
+    return columns.transmittance(atmosphere, whole)
+
+
+def _average(
+    sky: PathTraceSky, rays: Rays, key: PRNGKeyArray, hemisphere: bool
+) -> tuple[Float[Array, "rays w"], Float[Array, "rays w"]]:
+    """Mean over the paths of each ray and its standard error, a chunk of rays at a time."""
+    samples, replicates, lanes, panels = sky.resolution
+    number = rays.altitude.size
+    points = 1 << max(0, math.ceil(math.log2(samples / replicates)))
+    # Lanes of one replicate share its lattice; each gets some tens of paths, long enough to keep it busy to the end.
+    shares = min(max(1, lanes // (number * replicates)), max(1, points // 16))
+    shares = 1 << (shares.bit_length() - 1)
+    group = max(1, lanes // (replicates * shares))
+    chunks = -(-number // group)
+    group = -(-number // chunks)
+
+    bits = jax.vmap(lambda ray: jax.random.bits(jax.random.fold_in(key, ray), (2, replicates, 1), jnp.uint32))(
+        jnp.arange(number)
+    )
+    first = jnp.tile(jnp.arange(shares, dtype=jnp.uint32), group * replicates)
+
+    def chunk(arguments: tuple[Rays, Array]) -> Float[Array, "group replicate w"]:
+        some, bits = arguments
+
+        def spread(x: Array) -> Array:
+            return jnp.broadcast_to(x, (group, replicates, shares)).reshape(-1)
+
+        starts = jax.tree.map(lambda x: spread(x[:, None, None]), some)
+        total = trace(
+            sky.atmosphere,
+            sky.guide,
+            starts,
+            (spread(bits[:, 0]), spread(bits[:, 1])),
+            first,
+            count=points,
+            stride=shares,
+            panels=panels,
+            hemisphere=hemisphere,
+        )
+        return jnp.sum(total.reshape(-1, group, replicates, shares), axis=-1) / points
+
+    def split(x: Array) -> Array:
+        padded = jnp.concatenate([x, jnp.broadcast_to(x[-1:], (chunks * group - number, *x.shape[1:]))])
+        return padded.reshape(chunks, group, *x.shape[1:])
+
+    means = jnp.moveaxis(jax.lax.map(chunk, jax.tree.map(split, (rays, bits))), 1, -1)
+    means = means.reshape(chunks * group, replicates, -1)[:number]
+    return jnp.mean(means, axis=1), jnp.std(means, axis=1, ddof=1) / math.sqrt(replicates)
