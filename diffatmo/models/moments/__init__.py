@@ -34,11 +34,12 @@ __all__ = ["Moments", "MomentsSky", "MomentsView", "Shell"]
 class Moments(Model):
     """The default model. Fields are resolutions; the defaults keep the sky within about 0.1 % of Monte Carlo."""
 
-    altitudes: int = 12
+    altitudes: int = 16
     suns: int = 24
     first: Directions = Directions(sky=14, ground=6, azimuths=5, steps=5, degree=8)
-    iterate: Directions = Directions(sky=6, ground=4, azimuths=3, steps=3, degree=2)
-    last: Directions = Directions(sky=6, ground=4, azimuths=7, steps=4, degree=6)
+    iterate: Directions = Directions(sky=8, ground=5, azimuths=3, steps=6, degree=2)
+    last: Directions = Directions(sky=10, ground=6, azimuths=7, steps=6, degree=6)
+    source_degree: int = 4
     peak_azimuths: int = 32
     order: int = 5
     view_steps: int = 8
@@ -57,13 +58,14 @@ class Moments(Model):
             first=self.first,
             iterate=self.iterate,
             last=self.last,
+            source_degree=self.source_degree,
         )
 
     def sky(self, atmosphere: Atmosphere, shell: Shell | None = None) -> MomentsSky:
         """Solve for the moments. ``shell`` is :meth:`shell` of the same planet, where it is known already."""
         if shell is None:
             shell = self.shell(bottom_radius=atmosphere.bottom_radius, top_altitude=atmosphere.top_altitude)
-        degrees = Degrees(self.first.degree, self.iterate.degree, self.last.degree)
+        degrees = Degrees(self.first.degree, self.iterate.degree, self.source_degree, self.last.degree)
         state = solve(atmosphere, shell, order=self.order, degrees_=degrees, peak_azimuths=self.peak_azimuths)
         resolution = Resolution(
             degrees, self.view_steps, self.view_sky, self.view_ground, self.view_columns, self.view_fine_columns

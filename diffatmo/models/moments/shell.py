@@ -211,6 +211,7 @@ def build(
     first: Directions,
     iterate: Directions,
     last: Directions,
+    source_degree: int,
 ) -> Shell:
     """All geometry of a planet (radii and altitudes in km)."""
     altitude = top_altitude * table.stretch(jnp.linspace(0, 1, altitudes), ALTITUDE_LINEAR)
@@ -224,7 +225,7 @@ def build(
         dusk=dusk(mu_s, scale),
         first=Rays.build(*planet, first),
         iterate=_link(*planet, iterate, iterate.degree),
-        last=_link(*planet, last, iterate.degree),
+        last=_link(*planet, last, source_degree),
         bottom_radius=bottom_radius,
         top_altitude=top_altitude,
     )

@@ -16,11 +16,16 @@ from diffatmo.numerics import safe_divide
 
 
 class Degrees(NamedTuple):
-    """Degree to which the moments are kept: of single scattering, in the iteration, of all higher orders at its end."""
+    """Degrees to which the moments are kept."""
 
     first: int
+    """Of single scattering."""
     iterate: int
+    """Of all orders in the iteration."""
+    source: int
+    """Of single scattering, as a source of the higher orders in the last gather."""
     last: int
+    """Of the higher orders after it."""
 
 
 class State(NamedTuple):
@@ -170,6 +175,9 @@ def solve(atmosphere: Atmosphere, shell: Shell, *, order: int, degrees_: Degrees
     tail = _tail(term.moments[:, :1], previous.moments[:, :1])
     ground_tail = _tail(term.irradiance, previous.irradiance)
     total = State(total.moments + tail * term.moments, total.irradiance + ground_tail * term.irradiance)
-    beyond = _Transport.build(atmosphere, shell, shell.last, degrees_.iterate).apply(total, degrees_.last)
+    # What the iteration has of low degree, and what single scattering has of higher: the source of the last gather.
+    moments = first.moments[:, : len(pairs(degrees_.source))].at[:, : total.moments.shape[1]].set(total.moments)
+    gather = _Transport.build(atmosphere, shell, shell.last, degrees_.source)
+    beyond = gather.apply(State(moments, total.irradiance), degrees_.last)
     kept = beyond.moments.shape[1]
     return State(first.moments.at[:, :kept].add(beyond.moments), first.irradiance + beyond.irradiance)
