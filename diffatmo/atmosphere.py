@@ -300,7 +300,7 @@ def earth(wavelengths: Any = None) -> Atmosphere:
     Without ``wavelengths`` (nm): the three bands 680, 550, 440 nm of Bruneton & Neyret 2008 with Hillaire 2020's ozone
     (table 1: Rayleigh (5.802, 13.558, 33.1)e-3 /km over 8 km, Mie 3.996e-3 scattering and 0.444e-3 absorption over
     1.2 km, g = 0.8, ozone (0.650, 1.881, 0.085)e-3), a solar irradiance of 1 and an albedo of 0.3. With wavelengths, the
-    same air computed by :mod:`diffatmo.spectrum`: Rayleigh after Bucholtz 1995, 300 DU of ozone, grey aerosol, the
+    same air computed by :mod:`diffatmo.spectrum`: Rayleigh after Bodhaine et al. 1999, 300 DU of ozone, grey aerosol, the
     solar spectrum.
     """
     if wavelengths is None:

@@ -52,7 +52,13 @@ def rule(count: int, dtype: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _piece(
-    lower: Altitude, upper: Altitude, v_lower: Length, perigee: Altitude, radius: Scalar, stretch: Length, s: np.ndarray
+    lower: Altitude,
+    upper: Altitude,
+    v_lower: Length,
+    perigee: Altitude,
+    radius: Scalar,
+    stretch: Length,
+    s: Float[Array, "... n"],
 ) -> tuple[Float[Array, "... n"], Float[Array, "... n"], Float[Array, "... n"]]:
     """Altitude, distance from the perigee and d(distance)/ds at positions ``s`` of [0, 1] between two altitudes."""
     lower, v, perigee = lower[..., None], v_lower[..., None], perigee[..., None]

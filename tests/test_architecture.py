@@ -40,7 +40,7 @@ LEVELS = [
     ["fitting.report"],
     ["fitting"],
     ["diffatmo"],  # the lazy public interface
-    ["diffatmo.cli", "diffatmo.cli.common"],
+    ["diffatmo.cli", "diffatmo.cli.cache", "diffatmo.cli.common"],
     ["diffatmo.cli.keys", "diffatmo.cli.shipped"],
     ["diffatmo.cli.scenefile"],
     ["diffatmo.cli.images"],

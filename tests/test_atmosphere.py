@@ -32,7 +32,9 @@ def same(a, b):
     )
 
 
-@pytest.mark.parametrize("make", [earth, mars, lambda: earth(jnp.linspace(400, 700, 7)), lambda: atmosphere.loads(GOOD)])
+@pytest.mark.parametrize(
+    "make", [earth, mars, lambda: earth(jnp.linspace(400, 700, 7)), lambda: atmosphere.loads(GOOD)]
+)
 def test_toml_round_trip_loses_nothing(make, tmp_path):
     original = make()
     atmosphere.save(original, tmp_path / "a.toml")
@@ -72,7 +74,7 @@ def test_toml_round_trip_in_double_precision(x64):
 )
 def test_bad_values_are_refused_by_name(old, new, named):
     assert old in GOOD
-    with pytest.raises(AtmosphereError, match="test.toml") as refusal:
+    with pytest.raises(AtmosphereError, match=r"test\.toml") as refusal:
         atmosphere.loads(GOOD.replace(old, new), "test.toml")
     assert named in str(refusal.value)
 

@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -14,8 +15,8 @@ import pytest
 
 from diffatmo import atmosphere, imageio, models, scene, sun
 from diffatmo.camera import Equirectangular, Fisheye, Pinhole
+from diffatmo.cli import cache, shipped
 from diffatmo.cli import radiance as radiance_command
-from diffatmo.cli import shipped
 from diffatmo.cli.main import main
 from diffatmo.cli.scenefile import FREE
 from diffatmo.models.base import Model, Sky
@@ -354,6 +355,22 @@ def test_a_fault_of_ours_keeps_its_traceback(tmp_path, atm, monkeypatch):
     table = write_csv(tmp_path / "in.csv", DIRECTIONS, [[0.5, 60, 30, 10]])
     with pytest.raises(ValueError, match="a fault"):
         main(["radiance", atm, table, "-o", str(tmp_path / "out.csv")])
+
+
+@pytest.mark.parametrize(
+    ("preset", "caches", "expected"),
+    [(None, "here", "here/diffatmo"), (None, "/dev/null", None), ("", "here", ""), ("mine", "here", "mine")],
+)
+def test_compiled_programs_are_kept_where_the_user_keeps_caches(tmp_path, monkeypatch, preset, caches, expected):
+    monkeypatch.delitem(sys.modules, "jax")  # as at the start of a process
+    monkeypatch.setattr(sys, "platform", "linux")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / caches))
+    monkeypatch.delenv(cache.VARIABLE, raising=False)
+    if preset is not None:
+        monkeypatch.setenv(cache.VARIABLE, preset)
+    cache.enable()
+    found = os.environ.get(cache.VARIABLE)
+    assert found == (str(tmp_path / expected) if expected == "here/diffatmo" else expected)
 
 
 def test_help_and_version(capsys):

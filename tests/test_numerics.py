@@ -38,7 +38,9 @@ def test_scaled_erfcx_agrees_with_scipy(x64):
     """1.2e-7 is the stated accuracy of the fit."""
     x = jnp.linspace(0, 120, 500)
     np.testing.assert_allclose(numerics.scaled_erfcx(x, jnp.zeros_like(x)), special.erfcx(np.asarray(x)), rtol=2e-7)
-    np.testing.assert_allclose(numerics.scaled_erfcx(x, x * 0 - 2), np.exp(-2) * special.erfcx(np.asarray(x)), rtol=2e-7)
+    np.testing.assert_allclose(
+        numerics.scaled_erfcx(x, x * 0 - 2), np.exp(-2) * special.erfcx(np.asarray(x)), rtol=2e-7
+    )
 
 
 def test_gauss_legendre_is_exact_to_degree_2n_minus_1():

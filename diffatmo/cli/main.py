@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import click
 
 from diffatmo import __version__
+from diffatmo.cli import cache
 from diffatmo.cli.fit import fit
 from diffatmo.cli.radiance import radiance
 from diffatmo.cli.render import render
@@ -30,6 +31,8 @@ def diffatmo(context: click.Context) -> None:
     """
     if context.invoked_subcommand is None:
         click.echo(context.get_help())
+    else:
+        cache.enable()
 
 
 diffatmo.add_command(radiance)

@@ -233,7 +233,7 @@ class MomentsView(View):
     ) -> Float[Array, "r x w"]:
         """Multiple scattering along the rays of the grid: like ``path``, but nodes do not depend on nu, so that the
         interpolation in altitude is one matrix product.
-        """  # noqa: D205
+        """
         size, shell = sky.resolution, sky.shell
         radius, top = sky.atmosphere.bottom_radius, sky.atmosphere.top_altitude
         i, count, w, j = sky.state.moments.shape

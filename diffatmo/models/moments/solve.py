@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from diffatmo import geometry, phase, table, transmittance
-from diffatmo._types import Altitude, Scalar, Transmittance
+from diffatmo import phase, table, transmittance
+from diffatmo._types import Altitude
 from diffatmo.atmosphere import Atmosphere
 from diffatmo.models.moments.angular import cosines, degrees, orders, pairs, relative_nu
 from diffatmo.models.moments.shell import Links, Rays, Shell

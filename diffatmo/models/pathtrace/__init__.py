@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from diffatmo import geometry
 from diffatmo._types import Altitude, Cosine, Direction, Irradiance, Length, Radiance, Transmittance
@@ -174,7 +174,9 @@ def _transmittance(atmosphere: Atmosphere, rays: Rays) -> Float[Array, "w rays"]
     """To the end of each ray, or as far as it reaches."""
     mu = rays.up[0] * rays.view[0] + rays.up[1] * rays.view[1] + rays.up[2] * rays.view[2]
     mu = jnp.clip(mu, -1, 1)
-    ray = columns.segment(atmosphere, rays.altitude, mu, geometry.hits_ground(rays.altitude, mu, atmosphere.bottom_radius))
+    ray = columns.segment(
+        atmosphere, rays.altitude, mu, geometry.hits_ground(rays.altitude, mu, atmosphere.bottom_radius)
+    )
     end = jnp.minimum(rays.reach, ray.length)
     half = jnp.full((), 0.5, mu.dtype)
     whole, _ = columns.walk(atmosphere, ray, end, half, FINE, lambda carry, _: (carry, None), None)

@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, Int
 
 from diffatmo import geometry, phase
@@ -210,9 +209,7 @@ def expected(
         return second, (panel.start, panel.end, first, second, panel.before)
 
     zero = jnp.zeros_like(nu)
-    here = density(
-        cell(ray.altitude, mu_s, top), columns.densities(atmosphere, ray.altitude), (zero, zero, zero)
-    )
+    here = density(cell(ray.altitude, mu_s, top), columns.densities(atmosphere, ray.altitude), (zero, zero, zero))
     whole, steps = columns.walk(atmosphere, ray, end, jitter, panels, visit, here)
     below = sun_cell(jnp.clip((r_mu_s + ray.length * nu) / radius, -1, 1))
     fades = columns.transmittance(atmosphere, whole)

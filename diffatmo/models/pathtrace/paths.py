@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, UInt32
 
 from diffatmo import geometry, phase
-from diffatmo._types import Altitude, Cosine, Length
+from diffatmo._types import Altitude, Length
 from diffatmo.atmosphere import Atmosphere
 from diffatmo.models.pathtrace import columns, guide, lattice, vector
 from diffatmo.models.pathtrace.guide import Expected, Guide
@@ -95,9 +95,7 @@ def _draw_place(
         return values.reshape(-1)[flat]
 
     mass, length, start = pick(mass), pick(length), pick(light.start)
-    low, high = (
-        pick(density) + safe_divide(even, length) for density in (light.density_start, light.density_end)
-    )
+    low, high = (pick(density) + safe_divide(even, length) for density in (light.density_start, light.density_end))
     inside = jnp.clip(safe_divide(aim - (pick(cumulative) - mass), mass), 0, 1)
     # The inverse of the cumulative distribution of a density that runs linearly from `low` to `high`.
     slope = safe_divide(high - low, high + low)
