@@ -60,11 +60,11 @@ OUT_OF_STEPS = "stopped: not converged in the steps allowed"
 
 # The test for convergence is made here, so optimistix's own is set out of reach. Its trust region trusts a step only if
 # 99 % of the predicted fall of χ² came true, and then takes hundreds of steps along the curved valleys that images with
-# few determined combinations have; 70 % and a larger factor take tens.
+# few determined combinations have; with 75 % it takes tens.
 _SOLVER: optx.LevenbergMarquardt = eqx.tree_at(
     lambda solver: solver.search,
     optx.LevenbergMarquardt(rtol=1e-30, atol=1e-30),
-    optx.ClassicalTrustRegion(high_cutoff=0.7, high_constant=10.0),
+    optx.ClassicalTrustRegion(high_cutoff=0.75, high_constant=3.5),
 )
 
 

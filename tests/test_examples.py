@@ -20,7 +20,7 @@ def test_render_day(tmp_path):
     run("render_day", str(tmp_path / "day.png"), "16")
     sheet = imageio.read_image(tmp_path / "day.png", transfer="srgb").pixels
     assert sheet.shape == (32, 64, 3)
-    noon, night = sheet[8, 8], sheet[24, 56]  # the zeniths of the first and the last picture
+    noon, night = sheet[8, 24], sheet[24, 56]  # the zeniths of the second and the last picture
     assert noon[2] > noon[0]
     assert night[2] > night[0]  # ozone keeps the zenith blue after sunset
 

@@ -12,7 +12,7 @@ VARIABLE = "JAX_COMPILATION_CACHE_DIR"
 def enable() -> None:
     """Tell JAX where to keep what it compiles; where nothing can be kept, nothing changes.
 
-    JAX files a program under all that it depends on: its code, the version of the compiler, the features of the processor.
+    JAX files a program under all that it depends on: its code, the version of the compiler, the kind of processor.
     """
     if VARIABLE in os.environ or "jax" in sys.modules:
         return

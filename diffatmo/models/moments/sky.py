@@ -262,7 +262,7 @@ class MomentsView(View):
         x = (nu - mu * mu_s) / _half_width(mu, mu_s)
         columns = self.table.shape[1]
         column, column_weights = table.cubic_weights(0.5 * (jnp.clip(x, -1, 1) + 1), columns)
-        patch = jax.vmap(lambda r, c: jax.lax.dynamic_slice(self.table, (r, c, 0), (4, 4, self.table.shape[2])))
+        patch = jax.vmap(lambda r, c: jax.lax.dynamic_slice(self.table, (r, c, 0 * r), (4, 4, self.table.shape[2])))
         corners = patch(row.reshape(-1), column.reshape(-1)).reshape(
             *mu.shape, 4, 4, -1, self.log_transmittance.shape[1]
         )
