@@ -14,6 +14,7 @@ import optimistix as optx
 
 import diffatmo
 from diffatmo import color, imageio, render, sun
+from diffatmo.models.moments import Shell
 
 WANTED = {  # linear red, green, blue
     "zenith": (0.02, 0.08, 0.08),
@@ -32,6 +33,7 @@ class Task(NamedTuple):
     """What is given; an argument of what is compiled, because XLA would compute with constants for minutes."""
 
     air: diffatmo.Atmosphere
+    shell: Shell
     view: jax.Array
     sun: jax.Array
     wanted: jax.Array
@@ -43,7 +45,7 @@ def tuned(logs: dict[str, jax.Array], task: Task) -> diffatmo.Atmosphere:
 
 
 def colours(logs: dict[str, jax.Array], task: Task) -> jax.Array:
-    sky = diffatmo.Moments().sky(tuned(logs, task))
+    sky = diffatmo.Moments().sky(tuned(logs, task), task.shell)
     return EXPOSURE * sky.radiance(altitude=ALTITUDE, view=task.view, sun=task.sun).radiance
 
 
@@ -54,8 +56,11 @@ def mismatch(logs: dict[str, jax.Array], task: Task) -> tuple[jax.Array, dict[st
 
 def main(output: str = "teal_and_rose.png", size: str = "256") -> float:
     haze = replace(diffatmo.earth(), mie_absorption=jnp.full(3, 4e-3))
+    # The geometry of the planet stays what it is while the air changes.
+    shell = diffatmo.Moments().shell(bottom_radius=haze.bottom_radius, top_altitude=haze.top_altitude)
     task = Task(
         air=haze,
+        shell=shell,
         view=jnp.stack([sun.direction(zenith=np.radians(angle), azimuth=0.0) for angle in VIEW_ZENITH_DEG]),
         sun=sun.direction(zenith=np.radians(SUN_ZENITH_DEG), azimuth=np.radians(SUN_AZIMUTH_DEG)),
         wanted=jnp.array(list(WANTED.values())),

@@ -88,9 +88,8 @@ def observe(
         sun_exclusion: Radius, in radians, of the disc around the sun that is not used.
         view_zenith_max: Largest view zenith angle used, radians: π/2 for the sky alone, π for the ground too.
         horizon_exclusion: Elevations closer to 0 than this, radians, are not used.
-        exposure: ``"fixed"``, ``"free"`` (a factor of this image's own) or the name of a group of images that share
-        one;
-            with ``-per-channel`` appended (``"free-per-channel"``) there is one factor for each channel.
+        exposure: ``"fixed"``, ``"free"`` (a factor of this image's own), or the name of a group of images that share
+            one factor; with ``-per-channel`` appended (``"free-per-channel"``) there is one for each channel.
         exposure_value: The exposure as far as it is known: pixels = exposure_value × free factor × radiance.
         max_pixels: Average blocks of pixels until no more than this many are used.
         name: Of the image, in messages, tables and file names.

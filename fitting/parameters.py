@@ -106,7 +106,8 @@ class Linear(Bijection):
 
     def value(self, y):
         """See :class:`Bijection`."""
-        return self.unit * y
+        # The product may round to just above the bound.
+        return jnp.where(self.unit * y > self.upper, self.upper, self.unit * y)
 
     def coordinate(self, value):
         """See :class:`Bijection`."""
@@ -340,5 +341,6 @@ def _block(init: Atmosphere, field: str, scaled: bool) -> Block:
     if largest == 0:
         raise FitError(f"scaled: {field!r} starts at zero at every wavelength, so no factor can change it")
     one = jnp.ones_like(value, shape=(1,))
-    upper = one / largest if field == "ground_albedo" else jnp.inf * one
+    # A little below one, because the product of factor and ratio is rounded.
+    upper = (1 - 1e-6) * one / largest if field == "ground_albedo" else jnp.inf * one
     return Block(field, Linear(one, upper), one, value)

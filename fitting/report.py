@@ -77,8 +77,7 @@ Image = Float[np.ndarray, "height width w"]
 def check_writable(directory: str | Path, *, overwrite: bool = False) -> Path:
     """Create ``directory`` if need be and make sure that a report can be written there; call it before the fit.
 
-    Raises :class:`FitError` if the directory holds a report and ``overwrite`` is False, or nothing can be created in
-    it.
+    Raises :class:`FitError` if nothing can be created in the directory, or it holds a report and ``overwrite`` is False.
     """
     path = Path(directory)
     try:

@@ -241,8 +241,7 @@ def fit(
         observations: From :func:`fitting.observe`; all are explained by the one atmosphere.
         init: Where the search starts, and the value of everything that is not free.
         free: Names of the fields of :class:`~diffatmo.atmosphere.Atmosphere` to recover; a spectral field is free at
-        every
-            wavelength.
+            every wavelength.
         scaled: Those of the spectral ones of which only a common factor is free.
         model: How the sky is computed, :class:`~diffatmo.models.moments.Moments` by default.
         progress: Called after each step.
@@ -254,8 +253,7 @@ def fit(
 
     Raises:
         FitError: The fit cannot be started: a name that is not a parameter, images that do not go together, a model
-        that is
-            not finite at the start.
+            that is not finite at the start.
     """
     solution = solve(
         observations,

@@ -18,7 +18,8 @@ from diffatmo.camera import Equirectangular, Fisheye, Pinhole
 from diffatmo.cli import cache, shipped
 from diffatmo.cli import radiance as radiance_command
 from diffatmo.cli.main import main
-from diffatmo.cli.scenefile import FREE
+from diffatmo.cli.render import picture_size
+from diffatmo.cli.scenefile import FREE, read_scene
 from diffatmo.models.base import Model, Sky
 from diffatmo.models.base import Path as RayPath
 from diffatmo.render import Scene
@@ -151,7 +152,6 @@ def test_radiance_may_replace_an_empty_file(tmp_path, atm, toy):
     ("options", "expected"),
     [
         (["--width", "16"], Equirectangular(8, 16)),
-        (["--width", "16", "--upper"], Equirectangular(4, 16, upper=True)),
         (["--height", "8", "--projection", "fisheye", "--fov-deg", "120"], Fisheye(8, 8, math.radians(120))),
         (
             ["--width", "12", "--projection", "pinhole", "--fov-deg", "40", "--yaw-deg", "30", "--pitch-deg", "10"],
@@ -160,10 +160,10 @@ def test_radiance_may_replace_an_empty_file(tmp_path, atm, toy):
     ],
 )
 def test_render_writes_the_scene_it_was_asked_for(tmp_path, toy, options, expected):
-    exr, png = tmp_path / "sky.exr", tmp_path / "sky.png"
+    path = tmp_path / "sky.exr"
     place = ["--altitude-km", "2", "--sun-zenith-deg", "70", "--sun-azimuth-deg", "20", "--exposure", "3"]
-    assert main(["render", "mars", "-o", str(exr), "-o", str(png), *options, *place]) == 0
-    pixels, shown, notes = scene.load(exr)
+    assert main(["render", "mars", "-o", str(path), *options, *place]) == 0
+    pixels, shown, notes = scene.load(path)
     assert notes == {"model": "moments", "sun_disc": False}
     assert type(shown.camera) is type(expected)
     assert np.allclose(shown.camera.directions(), expected.directions(), atol=1e-6)
@@ -174,7 +174,33 @@ def test_render_writes_the_scene_it_was_asked_for(tmp_path, toy, options, expect
     radiance = sky.radiance(altitude=shown.altitude, view=expected.directions(), sun=shown.sun).radiance
     lit = np.asarray(expected.valid())
     assert np.allclose(pixels[lit], 3 * np.asarray(radiance)[lit], rtol=1e-5)
-    assert imageio.read_image(png, transfer="srgb").pixels.shape == pixels.shape
+
+
+def test_render_of_several_files(tmp_path, toy):
+    """The exposure of a PNG is chosen by the picture; asked for, it is that of both files."""
+    for name, options in {"chosen": [], "asked": ["--exposure", "0.01"]}.items():
+        outputs = [word for suffix in ("exr", "png") for word in ("-o", str(tmp_path / f"{name}.{suffix}"))]
+        assert main(["render", "earth", "--width", "8", "--upper", *outputs, *options]) == 0
+    linear = {name: scene.load(tmp_path / f"{name}.exr").pixels for name in ("chosen", "asked")}
+    shown = {name: imageio.read_image(tmp_path / f"{name}.png", transfer="srgb").pixels for name in linear}
+    assert np.allclose(linear["asked"], 0.01 * linear["chosen"], rtol=1e-5)
+    assert shown["chosen"].shape == (2, 8, 3)
+    assert 0.4 < shown["chosen"].max() <= 1
+    assert shown["asked"].max() < 0.1
+
+
+@pytest.mark.parametrize(
+    ("options", "width", "height", "expected"),
+    [
+        ({"projection": "equirectangular"}, None, None, (512, 256)),
+        ({"projection": "equirectangular", "upper": True}, 128, None, (128, 32)),
+        ({"projection": "equirectangular", "upper": True}, 128, 64, (128, 64)),
+        ({"projection": "fisheye"}, None, 100, (100, 100)),
+        ({"projection": "pinhole"}, 300, None, (300, 200)),
+    ],
+)
+def test_pixels_are_square_unless_said_otherwise(options, width, height, expected):
+    assert picture_size(options, width, height) == expected
 
 
 def toy_image(path, air, *, zenith, noise=0.01, seed=0, height=8, width=32):
@@ -345,6 +371,17 @@ def test_shipped_images_are_found():
 
 def test_default_parameters_are_those_of_an_atmosphere():
     assert set(FREE) <= set(atmosphere.FILE_KEYS)
+
+
+def test_files_in_the_readme_can_be_read(tmp_path):
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    air, described = (block.split("```")[0] for block in text.split("```toml\n")[1:])
+    assert atmosphere.dumps(atmosphere.loads(air)) == atmosphere.dumps(atmosphere.earth())
+    (tmp_path / "scene.toml").write_text(described)
+    spec = read_scene(tmp_path / "scene.toml")
+    assert spec.init == str(tmp_path / "start.toml")
+    assert spec.images[0].file == tmp_path / "sky_40.exr"
+    assert set(spec.scaled) <= set(spec.free)
 
 
 def test_a_fault_of_ours_keeps_its_traceback(tmp_path, atm, monkeypatch):
