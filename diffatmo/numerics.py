@@ -4,8 +4,13 @@ The rule: guard the input of ``sqrt``, ``log``, ``arccos`` and ``/``, never thei
 has a NaN derivative at ``x <= 0``, because the untaken branch is differentiated as well and 0 * inf is NaN.
 """
 
+from collections.abc import Callable
+from typing import Any
+
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
 
@@ -62,6 +67,34 @@ def scaled_erfcx(x: Float[Array, "..."], exponent: Float[Array, "..."]) -> Float
     for coefficient in reversed(_ERFCX):
         polynomial = polynomial * t + coefficient
     return t * jnp.exp(polynomial + exponent)
+
+
+def per_parameter(function: Callable[..., Float[Array, "n ..."]]) -> Callable[..., Float[Array, "n ..."]]:
+    """``function(parameters, *arrays)``, whose derivatives by the ``parameters`` are computed once for all tangents.
+
+    Row i of the value depends on parameter i only. A Jacobian in many parameters batches every operation over its
+    tangents; here the batch is only the product of the slopes with the tangents of the parameters, and arrays whose
+    tangents are known to be zero cost nothing. The product is one of matrices, because XLA would fuse a product of numbers
+    with what computes the slopes, and so compute them anew for every tangent.
+    """
+    shared = jax.custom_jvp(function)
+
+    def rule(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Any, Any]:
+        parameters, *arrays = primals
+        towards, *moving = tangents
+        value, slopes = jax.jvp(lambda p: function(p, *arrays), (parameters,), (jnp.ones_like(parameters),))
+        tangent = jnp.zeros_like(value)
+        if not isinstance(towards, SymbolicZero):
+            tangent = jnp.tensordot(jnp.diag(towards), slopes, axes=1, precision="highest")
+        flat, structure = jax.tree.flatten(moving, is_leaf=lambda t: isinstance(t, SymbolicZero))
+        if not all(isinstance(t, SymbolicZero) for t in flat):
+            dense = [jnp.zeros(t.shape, t.dtype) if isinstance(t, SymbolicZero) else t for t in flat]
+            arrays_moved = tuple(jax.tree.unflatten(structure, dense))
+            tangent = tangent + jax.jvp(lambda *a: function(parameters, *a), tuple(arrays), arrays_moved)[1]
+        return value, tangent
+
+    shared.defjvp(rule, symbolic_zeros=True)
+    return shared
 
 
 def gauss_legendre(count: int, lower: float = 0.0, upper: float = 1.0) -> tuple[np.ndarray, np.ndarray]:

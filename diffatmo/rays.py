@@ -22,6 +22,10 @@ STRETCH = 0.15
 """Stretch of the altitude map as a fraction of the atmosphere's thickness: 15 km on Earth, above every scale height."""
 
 
+PIECES = 2
+"""Pieces of a ray that is not cut at the planet's shadow."""
+
+
 class Nodes(NamedTuple):
     """Quadrature along rays, in path order. ``n`` counts the nodes of all pieces."""
 

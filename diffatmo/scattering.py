@@ -6,6 +6,7 @@ They are smooth functions of (altitude, mu, mu_s, nu); multiplied by the exact p
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -54,16 +55,13 @@ def integrate(
         altitude[..., None], mu[..., None], mu_s[..., None], nu[..., None], nodes.distance, radius
     )
     towards_sun, free = transmittance.to_top(atmosphere, nodes.altitude, mu_s_here)
-    columns = jnp.stack([jnp.where(free, a + b, 0) for a, b in zip(along, towards_sun, strict=True)])
-    # A matrix product, wavelength outermost, so that the columns are computed once and not once per wavelength.
-    depth = jnp.tensordot(transmittance.extinction(atmosphere), columns, axes=(0, 0))
-    light = jnp.exp(-depth) * free
-    air = nodes.weight * atmosphere.rayleigh_density(nodes.altitude)
-    aerosol = nodes.weight * atmosphere.mie_density(nodes.altitude)
+    depth = transmittance.spectral_depth(atmosphere, jax.tree.map(jnp.add, along, towards_sun))
+    light = jnp.exp(-jnp.where(free, depth, 0)) * free
+    air, aerosol = nodes.weight * transmittance.exponentials(transmittance.scale_heights(atmosphere), nodes.altitude)
     # τ^n / n! along the path to the sun, per power of the scattering coefficient.
     powers = [aerosol]
     for order in range(1, aureole + 1):
-        powers.append(powers[-1] * jnp.where(free, towards_sun.aerosol, 0) / order)
+        powers.append(powers[-1] * jnp.where(free, towards_sun.exponential[1], 0) / order)
     sums = jnp.einsum("w...n,c...n->...cw", light, jnp.stack([air, *powers])) * atmosphere.solar_irradiance
     scattering = atmosphere.mie_scattering
     return Single(

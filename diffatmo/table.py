@@ -37,11 +37,16 @@ def cubic_weights(unit: Float[Array, "..."], count: int) -> tuple[Int[Array, "..
     return first, jnp.stack(weights, axis=-1)
 
 
-def cubic_rows(unit: Float[Array, "..."], count: int) -> Float[Array, "... n"]:
-    """The same weights as dense rows over all nodes, for interpolation by matrix product."""
+def cubic_rows(unit: Float[Array, "..."], count: int, axis: int = -1) -> Float[Array, "... n"]:
+    """The same weights as dense rows over all nodes, on a new ``axis``, for interpolation by matrix product."""
     first, weights = cubic_weights(unit, count)
-    hit = (first[..., None] + jnp.arange(4))[..., None] == jnp.arange(count)
-    return jnp.sum(jnp.where(hit, weights[..., None], 0), axis=-2)
+    axis = axis % (unit.ndim + 1)
+    nodes = jnp.expand_dims(jnp.arange(count), [a for a in range(unit.ndim + 1) if a != axis])
+    offset = nodes - jnp.expand_dims(first, axis)
+    rows = jnp.zeros((), unit.dtype)
+    for number in range(4):
+        rows = jnp.where(offset == number, jnp.expand_dims(weights[..., number], axis), rows)
+    return rows
 
 
 def interpolate(

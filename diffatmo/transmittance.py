@@ -15,32 +15,48 @@ from jaxtyping import Array, Bool, Float
 from diffatmo import geometry, rays
 from diffatmo._types import Altitude, Cosine, Length, OpticalDepth, Scalar, Transmittance
 from diffatmo.atmosphere import Atmosphere
-from diffatmo.numerics import safe_divide, safe_sqrt, scaled_erfcx
+from diffatmo.numerics import per_parameter, safe_divide, safe_sqrt, scaled_erfcx
 
 _SHELL_STEPS = 3
 """Gauss nodes for the altitude, nearly quadratic in distance, between two shells."""
 
 
 class Columns(NamedTuple):
-    """∫ density ds along a path, km, of the three constituents."""
+    """∫ density ds along a path, km.
 
-    air: Float[Array, "..."]
-    aerosol: Float[Array, "..."]
-    absorber: Float[Array, "..."]
+    The absorber's tent is the sum of three ramps, and stays in three parts until it is multiplied with its coefficients: the
+    optical depth is then a product of matrices, for which XLA computes the columns once, not once per wavelength.
+    """
+
+    exponential: Float[Array, "2 ..."]
+    """Air, aerosol."""
+    ramps: Float[Array, "3 ..."]
+    """∫ max(0, a - h) ds for the upper edge, the center and the lower edge of the absorber, km²."""
 
 
-def extinction(atmosphere: Atmosphere) -> Float[Array, "3 w"]:
-    """Extinction per unit density of the three constituents, km^-1."""
-    return jnp.stack([atmosphere.rayleigh_scattering, atmosphere.mie_extinction, atmosphere.ozone_absorption])
+def edges(atmosphere: Atmosphere) -> tuple[Float[Array, " 3"], Float[Array, " 3"]]:
+    """Altitudes a_i, km, and factors c_i, km^-1, with which the absorber's density is Σ c_i max(0, a_i - h)."""
+    center, half_width = atmosphere.ozone_center_altitude, atmosphere.ozone_half_width
+    return center + half_width * jnp.array([1.0, 0.0, -1.0]), jnp.array([1.0, -2.0, 1.0]) / half_width
+
+
+def spectral_depth(atmosphere: Atmosphere, columns: Columns) -> Float[Array, "w ..."]:
+    """Optical depth with the wavelengths outermost: long inner axes keep the vector units busy."""
+    scattering = jnp.stack([atmosphere.rayleigh_scattering, atmosphere.mie_extinction], axis=1)
+    absorption = atmosphere.ozone_absorption[:, None] * edges(atmosphere)[1]
+    return jnp.tensordot(scattering, columns.exponential, axes=1, precision="highest") + jnp.tensordot(
+        absorption, columns.ramps, axes=1, precision="highest"
+    )
 
 
 def optical_depth(atmosphere: Atmosphere, columns: Columns) -> OpticalDepth:
-    """Optical depth of columns (km) of the three constituents."""
-    return (
-        columns.air[..., None] * atmosphere.rayleigh_scattering
-        + columns.aerosol[..., None] * atmosphere.mie_extinction
-        + columns.absorber[..., None] * atmosphere.ozone_absorption
-    )
+    """Optical depth of columns."""
+    return jnp.moveaxis(spectral_depth(atmosphere, columns), 0, -1)
+
+
+def scale_heights(atmosphere: Atmosphere) -> Float[Array, " 2"]:
+    """Those of air and of aerosol, km."""
+    return jnp.stack([atmosphere.rayleigh_scale_height, atmosphere.mie_scale_height])
 
 
 def _rising(
@@ -59,70 +75,85 @@ def _rising(
     return scaled_erfcx(m, -altitude / scale_height) * factor
 
 
-def tent_column(atmosphere: Atmosphere, perigee: Altitude, start: Length, end: Length) -> Float[Array, "..."]:
-    """Column of the absorber's tent between two points of a line, given as signed distances from its ``perigee``, km.
+def ramp_columns(
+    altitudes: Float[Array, " n"], perigee: Altitude, start: Length, end: Length, radius: Scalar
+) -> Float[Array, "n ..."]:
+    """∫ max(0, a - h) ds, km², for altitudes a between two points of a line.
 
-    The tent is a sum of ramps, (ramp(c + w) - 2 ramp(c) + ramp(c - w)) / w with ramp(a) = max(0, a - h), and the part of
-    the line under altitude a is one interval on which a - h is smooth.
+    The points are signed distances from the line's ``perigee``. The part of the line under altitude a is one interval, on
+    which a - h is smooth.
     """
-    radius, center, width = atmosphere.bottom_radius, atmosphere.ozone_center_altitude, atmosphere.ozone_half_width
     t, w, _ = rays.rule(_SHELL_STEPS, jnp.result_type(start).name)
     from_center = radius + perigee
+    a = altitudes.reshape(-1, *[1] * jnp.broadcast_arrays(perigee, start, end)[0].ndim)
+    reach = safe_sqrt((a - perigee) * (a + perigee + 2 * radius))
+    low, high = jnp.clip(start, -reach, reach), jnp.clip(end, -reach, reach)
+    total = jnp.zeros_like(low)
+    for position, weight in zip(t, w, strict=True):
+        z = low + (high - low) * position
+        h = perigee + safe_divide(z * z, safe_sqrt(from_center * from_center + z * z) + from_center)
+        total = total + weight * (a - h)
+    return (high - low) * total
 
-    def ramp(a: Altitude) -> Float[Array, "..."]:
-        reach = safe_sqrt((a - perigee) * (a + perigee + 2 * radius))
-        low, high = jnp.clip(start, -reach, reach), jnp.clip(end, -reach, reach)
-        total = jnp.zeros_like(low)
-        for position, weight in zip(t, w, strict=True):
-            z = low + (high - low) * position
-            h = perigee + safe_divide(z * z, safe_sqrt(from_center * from_center + z * z) + from_center)
-            total = total + weight * (a - h)
-        return (high - low) * total
 
-    return (ramp(center + width) - 2 * ramp(center) + ramp(center - width)) / width
+@per_parameter
+def _exponentials_to_top(
+    heights: Float[Array, " n"], altitude: Altitude, mu: Cosine, radius: Scalar, top: Altitude
+) -> Float[Array, "n ..."]:
+    """Columns of exp(-h / H) from a point to the top: to infinity, less what is above the top.
+
+    A ray that falls to a perigee p and rises again has X(h, -mu) = 2 X(p, 0) - X(h, mu).
+    """
+    perigee = geometry.perigee_altitude(altitude, mu, radius)
+    v = jnp.abs(mu) * safe_sqrt((radius + altitude) / (1 + geometry.sine(mu)))
+    rise = jnp.maximum(top - altitude, 0)
+    v_top = v + safe_divide(rise, v + safe_sqrt(v * v + rise))
+    lowest = jnp.maximum(perigee, 0)
+    scale_height = heights.reshape(-1, *[1] * v.ndim)
+    here = _rising(altitude, perigee, v, scale_height, radius)
+    above = _rising(altitude + rise, perigee, v_top, scale_height, radius)
+    level = _rising(lowest, lowest, jnp.zeros_like(v), scale_height, radius)
+    return safe_sqrt(math.pi * scale_height) * (jnp.where(mu < 0, 2 * level - here, here) - above)
 
 
 def to_top(atmosphere: Atmosphere, altitude: Altitude, mu: Cosine) -> tuple[Columns, Bool[Array, "..."]]:
     """Columns from a point inside the atmosphere to the top, and whether the ray is free (does not meet the ground).
 
-    A ray that falls to a perigee p and rises again has X(h, -mu) = 2 X(p, 0) - X(h, mu). The columns of a ray that is not
-    free are finite but mean nothing.
+    The columns of a ray that is not free are finite but mean nothing.
     """
     radius, top = atmosphere.bottom_radius, atmosphere.top_altitude
     perigee = geometry.perigee_altitude(altitude, mu, radius)
-    falls = mu < 0
-    v = jnp.abs(mu) * safe_sqrt((radius + altitude) / (1 + geometry.sine(mu)))
-    rise = jnp.maximum(top - altitude, 0)
-    v_top = v + safe_divide(rise, v + safe_sqrt(v * v + rise))
-    lowest = jnp.maximum(perigee, 0)
-
-    def column(scale_height: Scalar) -> Float[Array, "..."]:
-        here = _rising(altitude, perigee, v, scale_height, radius)
-        above = _rising(altitude + rise, perigee, v_top, scale_height, radius)
-        level = _rising(lowest, lowest, jnp.zeros_like(v), scale_height, radius)
-        return safe_sqrt(math.pi * scale_height) * (jnp.where(falls, 2 * level - here, here) - above)
-
-    start = (radius + altitude) * mu
     end = safe_sqrt((top - perigee) * (top + perigee + 2 * radius))
     columns = Columns(
-        column(atmosphere.rayleigh_scale_height),
-        column(atmosphere.mie_scale_height),
-        tent_column(atmosphere, perigee, start, end),
+        _exponentials_to_top(scale_heights(atmosphere), altitude, mu, radius, top),
+        ramp_columns(edges(atmosphere)[0], perigee, (radius + altitude) * mu, end, radius),
     )
-    return columns, ~falls | (perigee >= 0)
+    return columns, (mu >= 0) | (perigee >= 0)
+
+
+@per_parameter
+def exponentials(heights: Float[Array, " n"], altitude: Altitude) -> Float[Array, "n ..."]:
+    """exp(-h / H): with two scale heights the relative densities of air and of aerosol."""
+    return jnp.exp(-altitude / heights.reshape(-1, *[1] * altitude.ndim))
 
 
 def columns_along(
     atmosphere: Atmosphere, altitude: Altitude, mu: Cosine, nodes: rays.Nodes, steps: int
 ) -> tuple[Columns, Columns]:
     """Columns from the start of a ray to each of its nodes, and to its end."""
-    perigee = geometry.perigee_altitude(altitude, mu, atmosphere.bottom_radius)
-    start = (atmosphere.bottom_radius + altitude) * mu
-    air, all_air = rays.accumulate(atmosphere.rayleigh_density(nodes.altitude), nodes, steps)
-    aerosol, all_aerosol = rays.accumulate(atmosphere.mie_density(nodes.altitude), nodes, steps)
-    absorber = tent_column(atmosphere, perigee[..., None], start[..., None], start[..., None] + nodes.distance)
-    all_absorber = tent_column(atmosphere, perigee, start, start + jnp.sum(nodes.weight, axis=-1))
-    return Columns(air, aerosol, absorber), Columns(all_air, all_aerosol, all_absorber)
+    radius = atmosphere.bottom_radius
+    perigee = geometry.perigee_altitude(altitude, mu, radius)
+    start = (radius + altitude) * mu
+    densities = exponentials(scale_heights(atmosphere), nodes.altitude)
+    inside, whole = rays.accumulate(densities, nodes, steps)
+    tops, _ = edges(atmosphere)
+    ends = start + jnp.sum(nodes.weight, axis=-1)
+    return (
+        Columns(
+            inside, ramp_columns(tops, perigee[..., None], start[..., None], start[..., None] + nodes.distance, radius)
+        ),
+        Columns(whole, ramp_columns(tops, perigee, start, ends, radius)),
+    )
 
 
 def along(atmosphere: Atmosphere, altitude: Altitude, mu: Cosine, distance: Length, steps: int = 48) -> Transmittance:

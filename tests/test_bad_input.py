@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import skimage.io
+from PIL import Image
 
 from diffatmo import atmosphere, imageio, scene, sun
 from diffatmo.camera import Equirectangular
@@ -80,7 +80,7 @@ def files(tmp_path_factory):
     imageio.write_exr(folder / "damaged.exr", sky(), {scene.ATTRIBUTE: "version = 1\n"})
     imageio.write_exr(folder / "flat.exr", np.full((16, 32, 3), 0.1, np.float32))
     imageio.write_png(folder / "eight_bits.png", sky())
-    skimage.io.imsave(folder / "photo.jpg", (255 * sky()).astype(np.uint8), check_contrast=False)
+    Image.fromarray((255 * sky()).astype(np.uint8)).save(folder / "photo.jpg")
 
     scenes = {
         "unknown_key.scene": '[[image]]\nfile = "good.exr"\nsun_zenit_deg = 40\n',

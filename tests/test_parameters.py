@@ -83,7 +83,8 @@ def test_scaled_fields_keep_their_ratios():
     np.testing.assert_allclose(doubled.ozone_absorption, 2 * init.ozone_absorption, rtol=1e-6)
     # An albedo stays below one at every wavelength.
     albedo = select(toy_sky.change(init, ground_albedo=[0.2, 0.4, 0.1]), ["ground_albedo"], ["ground_albedo"])
-    assert float(albedo.limits[1][0]) == pytest.approx(2.5)
+    # The bound is a float32 just below 1 over the largest albedo.
+    assert float(albedo.limits[1][0]) == pytest.approx(2.5, rel=1e-5)
 
 
 def test_colours_share_a_tangent_among_wavelengths():

@@ -54,14 +54,14 @@ def polar(degree: int, mu: Cosine) -> Float[Array, "... lm"]:
     return table.chebyshev(degree + 1, mu) @ jnp.asarray(_expansion(degree), mu.dtype)
 
 
-def azimuthal(degree: int, mu: Cosine, mu_s: Cosine, nu: Cosine) -> Float[Array, "... lm"]:
-    """C_m(w, q) = (sinθ sinθ_s)^m cos(m φ) for the m of every (l, m)."""
+def azimuthal(degree: int, mu: Cosine, mu_s: Cosine, nu: Cosine) -> Float[Array, "... m"]:
+    """C_m(w, q) = (sinθ sinθ_s)^m cos(m φ) for m = 0 … degree."""
     w = nu - mu * mu_s
     q = (1 - mu * mu) * (1 - mu_s * mu_s)
     multiple = [jnp.ones_like(w), w]
     for _ in range(2, degree + 1):
         multiple.append(2 * w * multiple[-1] - q * multiple[-2])
-    return jnp.stack(multiple[: degree + 1], axis=-1)[..., orders(degree)]
+    return jnp.stack(multiple[: degree + 1], axis=-1)
 
 
 def projection(degree: int, mu: Cosine) -> Float[Array, "... lm"]:

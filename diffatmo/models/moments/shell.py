@@ -105,11 +105,13 @@ class Links(eqx.Module):
     rays: Rays
     altitude_rows: Float[Array, "i k n h"]
     """Interpolation in altitude."""
-    sun_rows: Float[Array, "i k n s pj"]
+    sun_rows: Float[Array, "i k n s p j"]
     """Interpolation in the sun's height, times ``dusk`` there."""
-    angular: Float[Array, "i k n lm pj"]
-    """Π_lm C_m in the direction of the ray."""
-    ground_rows: Float[Array, "i g s pj"]
+    polar: Float[Array, "i k n lm"]
+    """Π_lm in the direction of the ray."""
+    azimuthal: Float[Array, "i k n m p j"]
+    """C_m in the direction of the ray."""
+    ground_rows: Float[Array, "i g s p j"]
     """Interpolation of the ground's irradiance where the ray ends."""
 
 
@@ -186,18 +188,18 @@ def _link(
     mu_here = geometry.mu_along(start, r.mu[..., None], r.nodes.distance, radius)
     nu = relative_nu(r.mu[..., None, None], mu_s, cosines(count.azimuths, altitude.dtype)[:, None])
     here = jnp.broadcast_to(mu_here[..., None, None], r.mu_s_here.shape)
-    angular = azimuthal(degree, here, r.mu_s_here, nu[:, :, None]) * polar(degree, mu_here)[..., None, None, :]
+    around = azimuthal(degree, here, r.mu_s_here, nu[:, :, None])
 
-    def sun_rows(value: Cosine) -> Float[Array, "... s pj"]:
-        rows = table.cubic_rows(sun_unit(value, radius, top), mu_s.size)
-        rows = rows * dusk(value, grazing(radius, top))[..., None]
-        return jnp.swapaxes(rows.reshape(*value.shape[:-2], -1, mu_s.size), -1, -2)
+    def sun_rows(value: Cosine) -> Float[Array, "... s p j"]:
+        rows = table.cubic_rows(sun_unit(value, radius, top), mu_s.size, axis=-3)
+        return rows * dusk(value, grazing(radius, top))[..., None, :, :]
 
     return Links(
         rays=r,
         altitude_rows=table.cubic_rows(altitude_unit(r.nodes.altitude, top), altitude.size),
         sun_rows=sun_rows(r.mu_s_here),
-        angular=jnp.swapaxes(angular.reshape(*angular.shape[:3], -1, angular.shape[-1]), -1, -2),
+        polar=polar(degree, mu_here),
+        azimuthal=jnp.moveaxis(around, -1, -3),
         ground_rows=sun_rows(r.mu_s_ground),
     )
 

@@ -1,18 +1,28 @@
-"""The moments of all orders of scattering: the first by quadrature, the others by iterating a linear map."""
+"""The moments of all orders of scattering: the first by quadrature, the others by iterating a linear map.
 
+Contractions over more than one axis, or of vectors in a batch, are written as sums of products: XLA makes loops of them that
+keep the vector units busy. As ``einsum`` they are batches of tiny matrix products, ten times slower.
+"""
+
+from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from diffatmo import phase, table, transmittance
-from diffatmo._types import Altitude
+from diffatmo._types import Altitude, Scalar
 from diffatmo.atmosphere import Atmosphere
 from diffatmo.models.moments.angular import cosines, degrees, orders, pairs, relative_nu
 from diffatmo.models.moments.shell import Links, Rays, Shell
-from diffatmo.numerics import safe_divide
+from diffatmo.numerics import per_parameter, safe_divide
+from diffatmo.rays import PIECES, Nodes
+
+CHUNK = 2
+"""Altitude nodes computed at once: few enough for the cache, enough to keep the processors busy."""
 
 
 class Degrees(NamedTuple):
@@ -41,16 +51,22 @@ def _tail(last: Float[Array, "..."], previous: Float[Array, "..."]) -> Float[Arr
     return ratio / (1 - ratio)
 
 
-def _moments(r: Rays, by_order: Float[Array, "m i k w j"], degree: int) -> Float[Array, "i lm w j"]:
+def _moments(r: Rays, by_order: Float[Array, "i m k w j"], degree: int) -> Float[Array, "i lm w j"]:
     """Moments M_lm to ``degree`` from the azimuthal integrals ∫ L cos(m φ) dφ at every direction node."""
     count = len(pairs(degree))
-    moments = jnp.einsum("cikwj,ikc->icwj", by_order[orders(degree)], r.project[..., :count])
-    return moments * r.sun_scale[:count, None]
+    project = jnp.swapaxes(r.project[..., :count], 1, 2)[..., None, None]
+    return jnp.sum(by_order[:, orders(degree)] * project, axis=2) * r.sun_scale[:count, None]
+
+
+def _below(values: Float[Array, "..."], sky: int, *, axis: int) -> Float[Array, "..."]:
+    """``values`` in the directions below the horizon, after ``sky`` zeros for those above."""
+    return jnp.pad(values, [(sky if a == axis else 0, 0) for a in range(values.ndim)])
 
 
 def _irradiance(r: Rays, around: Float[Array, "i k w j"]) -> Float[Array, "w j"]:
     """Irradiance of the ground by the sky: ∫ L dφ at the lowest node from above its horizon, times mu."""
-    return jnp.einsum("kwj,k->wj", around[0], jnp.where(r.ground, 0, r.solid_angle[0] * r.mu[0]))
+    weight = jnp.where(r.ground, 0, r.solid_angle[0] * r.mu[0])
+    return jnp.sum(around[0] * weight[:, None, None], axis=0)
 
 
 def _harmonics(degree: int, cosine: Float[Array, " p"]) -> Float[Array, "p m"]:
@@ -61,49 +77,95 @@ def _harmonics(degree: int, cosine: Float[Array, " p"]) -> Float[Array, "p m"]:
 def _first_order(atmosphere: Atmosphere, shell: Shell, degree: int, peak_azimuths: int) -> State:
     """Moments and ground irradiance, over ``dusk``, of light scattered once or reflected by the ground once."""
     r = shell.first
-    nodes = r.nodes
-    i, k, n = nodes.altitude.shape
-    p, j = r.azimuths, shell.mu_s.size
-    start = jnp.broadcast_to(shell.altitude[:, None], r.mu.shape)
-    along, end = transmittance.columns_along(atmosphere, start, r.mu, nodes, r.steps)
-    view = jnp.exp(-transmittance.optical_depth(atmosphere, along)) * nodes.weight[..., None]
-    # Few axes, long inside, wavelengths outside: short inner axes would cost the vector units. The optical depth is a
-    # matrix product so that the columns are computed once, not once per wavelength.
-    mu_s_here = r.mu_s_here.reshape(i * k * n, p * j)
-    here = jnp.broadcast_to(nodes.altitude.reshape(-1, 1), mu_s_here.shape)
-    towards_sun, free = transmittance.to_top(atmosphere, here, mu_s_here)
-    columns = jnp.stack([jnp.where(free, column, 0) for column in towards_sun])
-    depth = jnp.einsum("cw,crt->wrt", transmittance.extinction(atmosphere), columns)
-    light = (jnp.exp(-depth) * free).reshape(-1, i, k, n, p * j)
-    profiles = (atmosphere.rayleigh_density, atmosphere.mie_density)
-    coefficients = (atmosphere.rayleigh_scattering, atmosphere.mie_scattering)
-    weight = jnp.stack(
-        [profile(nodes.altitude)[..., None] * view * c for profile, c in zip(profiles, coefficients, strict=True)]
+    parts = shell.altitude, r.mu, r.solid_angle, r.nodes, r.mu_s_here, r.mu_s_ground
+    # One altitude node after another: the temporary arrays stay in the cache.
+    by_order = jax.lax.map(
+        lambda part: _first_order_at(atmosphere, shell.mu_s, degree, peak_azimuths, *part), parts, batch_size=CHUNK
     )
-    smooth = jnp.einsum("wiknt,ciknw->wikct", light, weight).reshape(-1, i, k, 2, p, j)
+    by_order = by_order * (atmosphere.solar_irradiance[:, None] / shell.dusk)
+    return State(_moments(r, by_order, degree), _irradiance(r, by_order[:, 0]))
+
+
+def _peak(mie_phase: str) -> Callable[..., Float[Array, "1 ..."]]:
+    """The aerosol's phase function with g, shape (1,), at every nu, normalised over the very nodes it is summed on.
+
+    A peak between nodes loses no light.
+    """
+
+    @per_parameter
+    def peak(
+        g: Float[Array, " 1"], nu: Float[Array, "f k j"], solid_angle: Float[Array, " k"]
+    ) -> Float[Array, "1 f k j"]:
+        aerosol = phase.mie(nu, g[0], mie_phase)
+        norm = 2 * jnp.pi * jnp.mean(jnp.sum(aerosol * solid_angle[:, None], axis=1), axis=0)
+        return (aerosol / norm)[None]
+
+    return peak
+
+
+def _first_order_at(
+    atmosphere: Atmosphere,
+    mu_s: Float[Array, " j"],
+    degree: int,
+    peak_azimuths: int,
+    altitude: Scalar,
+    mu: Float[Array, " k"],
+    solid_angle: Float[Array, " k"],
+    nodes: Nodes,
+    mu_s_here: Float[Array, "k n p j"],
+    mu_s_ground: Float[Array, "g p j"],
+) -> Float[Array, "m k w j"]:
+    """∫ L cos(m φ) dφ at one altitude."""
+    k, n, p, j = mu_s_here.shape
+    start = jnp.broadcast_to(altitude, mu.shape)
+    along, end = transmittance.columns_along(atmosphere, start, mu, nodes, n // PIECES)
+    view = jnp.exp(-transmittance.optical_depth(atmosphere, along)) * nodes.weight[..., None]
+    # Few axes, long inside, wavelengths outside: short inner axes would cost the vector units.
+    mu_s_flat = mu_s_here.reshape(k * n, p * j)
+    here = jnp.broadcast_to(nodes.altitude.reshape(-1, 1), mu_s_flat.shape)
+    towards_sun, free = transmittance.to_top(atmosphere, here, mu_s_flat)
+    depth = transmittance.spectral_depth(atmosphere, towards_sun)
+    light = (jnp.exp(-jnp.where(free, depth, 0)) * free).reshape(-1, k, n, p * j)
+    densities = transmittance.exponentials(transmittance.scale_heights(atmosphere), nodes.altitude)
+    coefficients = jnp.stack([atmosphere.rayleigh_scattering, atmosphere.mie_scattering])
+    weight = densities[..., None] * view * coefficients[:, None, None]
+    smooth = jnp.einsum("cknw,wknt->kwct", weight, light).reshape(k, -1, 2, p, j)
     # In azimuth the integrals are polynomials of low degree; the peak of the phase function needs many more azimuths, but
     # only its own integrals against those polynomials and cos(m φ).
-    dtype = shell.altitude.dtype
-    fine = cosines(peak_azimuths, dtype)
-    to_fine = table.chebyshev(p, fine) @ jnp.asarray(table.chebyshev_coefficients(p), dtype)
+    fine = cosines(peak_azimuths, mu.dtype)
+    to_fine = table.chebyshev(p, fine) @ jnp.asarray(table.chebyshev_coefficients(p), mu.dtype)
     harmonics = _harmonics(degree, fine)
-    products = (to_fine[:, :, None] * harmonics[:, None, :]).reshape(peak_azimuths, -1)
-    nu = relative_nu(r.mu[..., None, None], shell.mu_s[:, None], fine)
-    aerosol = phase.mie(nu, atmosphere.mie_g, atmosphere.mie_phase)
-    # Normalised over the very nodes it is summed on: a peak between nodes loses no light.
-    norm = jnp.einsum("ikj,ik->ij", aerosol @ harmonics[:, 0], r.solid_angle)
-    phases = jnp.stack([phase.rayleigh(nu), aerosol / norm[:, None, :, None]])
-    turned = (phases @ products).reshape(2, i, k, j, p, degree + 1)
-    by_order = jnp.einsum("cikjpm,wikcpj->mikwj", turned, smooth)
-    ground_level = jnp.zeros_like(r.mu_s_ground)
-    sunlit = jnp.maximum(r.mu_s_ground, 0)[..., None] * transmittance.to_sun(atmosphere, ground_level, r.mu_s_ground)
-    sky_count = k - r.mu_s_ground.shape[1]
-    survives = jnp.exp(-transmittance.optical_depth(atmosphere, end))[:, sky_count:, None, None, :]
+    products = to_fine[:, :, None] * harmonics[:, None, :]
+    nu = relative_nu(mu[:, None], mu_s, fine[:, None, None])
+    phases = phase.rayleigh(nu), _peak(atmosphere.mie_phase)(atmosphere.mie_g[None], nu, solid_angle)[0]
+    turned = [jnp.swapaxes(jnp.tensordot(products.T, phase_, axes=1), 1, 2)[:, :, None] for phase_ in phases]
+    by_order = sum(jnp.sum(turned[c] * smooth[:, :, c], axis=3) for c in range(2))
+    ground_level = jnp.zeros_like(mu_s_ground)
+    sunlit = jnp.maximum(mu_s_ground, 0)[..., None] * transmittance.to_sun(atmosphere, ground_level, mu_s_ground)
+    sky = k - mu_s_ground.shape[0]
+    survives = jnp.exp(-transmittance.optical_depth(atmosphere, end))[sky:, None, None, :]
     reflected = atmosphere.ground_albedo / jnp.pi * survives * sunlit
-    reflected = jnp.einsum("igpjw,pm->migwj", reflected, to_fine.T @ harmonics)
-    by_order = by_order.at[:, :, sky_count:].add(reflected)
-    by_order = by_order * (atmosphere.solar_irradiance[:, None] / shell.dusk)
-    return State(_moments(r, by_order, degree), _irradiance(r, by_order[0]))
+    reflected = jnp.tensordot(reflected, to_fine.T @ harmonics, axes=(1, 0)).transpose(3, 0, 2, 1)
+    return by_order + _below(reflected, sky, axis=1)
+
+
+def gather(
+    moments: Float[Array, "h lm w s"],
+    altitude_rows: Float[Array, "k n h"],
+    weight: Float[Array, "k n lm w"],
+    sun_rows: Float[Array, "k n s *suns"],
+    azimuthal: Float[Array, "k n m *suns"],
+) -> Float[Array, "k w *suns"]:
+    """Light scattered towards the start of ``k`` rays: moments interpolated to their ``n`` nodes, weighted, summed.
+
+    Sums over l come first, as what depends on azimuth depends on m only.
+    """
+    there = jnp.einsum("knh,hcws->kncws", altitude_rows, moments) * weight[..., None]
+    degree = azimuthal.shape[2] - 1
+    of_m = [np.flatnonzero(orders(degree) == m) for m in range(degree + 1)]
+    by_m = jnp.stack([sum(there[:, :, c] for c in chosen) for chosen in of_m], axis=2)
+    here = jnp.einsum("knmws,kns...->knmw...", by_m, sun_rows)
+    return jnp.sum(here * azimuthal[:, :, :, None], axis=(1, 2))
 
 
 class _Transport(eqx.Module):
@@ -112,8 +174,8 @@ class _Transport(eqx.Module):
     shell: Shell
     links: Links
     albedo: Float[Array, " w"]
-    weight: Float[Array, "i k n l w"]
-    """T times (β_R χ^R_l + β_M χ^M_l) times the quadrature weight."""
+    weight: Float[Array, "i k n lm w"]
+    """T times (β_R χ^R_l + β_M χ^M_l) Π_lm times the quadrature weight."""
     survives: Float[Array, "i g w"]
     degree: int = eqx.field(static=True)
 
@@ -124,35 +186,30 @@ class _Transport(eqx.Module):
         start = jnp.broadcast_to(shell.altitude[:, None], r.mu.shape)
         along, end = transmittance.columns_along(atmosphere, start, r.mu, r.nodes, r.steps)
         view = jnp.exp(-transmittance.optical_depth(atmosphere, along)) * r.nodes.weight[..., None]
-        source = source_moments(atmosphere, r.nodes.altitude, degree)
+        source = source_moments(atmosphere, r.nodes.altitude, degree)[..., degrees(degree), :] * links.polar[..., None]
         survives = jnp.exp(-transmittance.optical_depth(atmosphere, end))[:, r.mu.shape[1] - r.mu_s_ground.shape[1] :]
         return cls(shell, links, atmosphere.ground_albedo, view[..., None, :] * source, survives, degree)
 
     def apply(self, state: State, degree: int) -> State:
         """The next order; its moments to ``degree``."""
         links, r = self.links, self.links.rays
-        i, count, w, j = state.moments.shape
-        k, n, p = *r.nodes.altitude.shape[1:], r.azimuths
-        there = jnp.einsum("iknh,hc->iknc", links.altitude_rows, state.moments.reshape(i, -1))
-        moments = jnp.einsum("ikncs,iknst->iknct", there.reshape(i, k, n, count * w, j), links.sun_rows)
-        moments = moments.reshape(i, k, n, count, w, p * j)
-        weight = self.weight[:, :, :, degrees(self.degree), :, None]
-        radiance = jnp.sum(moments * links.angular[:, :, :, :, None] * weight, axis=(2, 3))
-        falling = jnp.einsum("ws,igst->igwt", state.irradiance, links.ground_rows)
-        reflected = (self.albedo / jnp.pi * self.survives)[..., None] * falling
-        radiance = radiance.at[:, k - reflected.shape[1] :].add(reflected)
-        radiance = radiance.reshape(i, k, w, p, j) / self.shell.dusk
-        harmonics = _harmonics(degree, cosines(p, radiance.dtype))
-        by_order = jnp.einsum("ikwpj,pm->mikwj", radiance, harmonics)
-        return State(_moments(r, by_order, degree), _irradiance(r, by_order[0]))
+        parts = links.altitude_rows, self.weight, links.sun_rows, links.azimuthal
+        # One altitude node after another: the temporary arrays stay in the cache.
+        radiance = jax.lax.map(lambda part: gather(state.moments, *part), parts)
+        falling = jnp.einsum("ws,igspj->igwpj", state.irradiance, links.ground_rows)
+        reflected = (self.albedo / jnp.pi * self.survives)[..., None, None] * falling
+        radiance = radiance + _below(reflected, r.mu.shape[1] - reflected.shape[1], axis=1)
+        harmonics = _harmonics(degree, cosines(r.azimuths, radiance.dtype))
+        by_order = jnp.sum(radiance[:, None] * harmonics.T[:, None, None, :, None], axis=4) / self.shell.dusk
+        return State(_moments(r, by_order, degree), _irradiance(r, by_order[:, 0]))
 
 
 def source_moments(atmosphere: Atmosphere, altitude: Altitude, degree: int) -> Float[Array, "... l w"]:
     """β_R(h) χ^R_l + β_M(h) χ^M_l, km^-1, for l = 0 … degree."""
     air = jnp.asarray(phase.rayleigh_moments(degree), altitude.dtype)[:, None] * atmosphere.rayleigh_scattering
     aerosol = phase.mie_moments(atmosphere.mie_g, degree, atmosphere.mie_phase)[:, None] * atmosphere.mie_scattering
-    densities = atmosphere.rayleigh_density(altitude), atmosphere.mie_density(altitude)
-    return densities[0][..., None, None] * air + densities[1][..., None, None] * aerosol
+    densities = transmittance.exponentials(transmittance.scale_heights(atmosphere), altitude)[..., None, None]
+    return densities[0] * air + densities[1] * aerosol
 
 
 def solve(atmosphere: Atmosphere, shell: Shell, *, order: int, degrees_: Degrees, peak_azimuths: int) -> State:

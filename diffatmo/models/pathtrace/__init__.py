@@ -17,15 +17,16 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from diffatmo import geometry
 from diffatmo._types import Altitude, Cosine, Direction, Irradiance, Length, Radiance, Transmittance
 from diffatmo.atmosphere import Atmosphere
 from diffatmo.models.base import Model, Path, Ray, Sky
-from diffatmo.models.pathtrace import columns, guide
+from diffatmo.models.pathtrace import columns, guide, vector
 from diffatmo.models.pathtrace.guide import Guide
 from diffatmo.models.pathtrace.paths import Rays, trace
+from diffatmo.models.pathtrace.vector import Vector
 from diffatmo.numerics import safe_divide
 
 __all__ = ["PathTrace", "PathTraceSky"]
@@ -61,20 +62,28 @@ class PathTrace(Model):
 
     ``samples`` is rounded up to ``replicates`` times a power of two; the standard error comes from that many independent
     replicates. ``lanes`` paths are computed side by side, which bounds the memory. ``panels`` resolve the atmosphere
-    along a ray; 12 suit exponentials and layers some kilometres thick.
+    along a ray; 10 suit exponentials and layers some kilometres thick.
     """
 
     samples: int = 4096
     seed: int = 0
     replicates: int = 32
     lanes: int = 8192
-    panels: int = 12
+    panels: int = 10
 
     def sky(self, atmosphere: Atmosphere) -> "PathTraceSky":
         """Prepare the guide; the paths are traced when the sky is asked."""
         atmosphere = _refuse_derivatives(atmosphere)
         resolution = Resolution(self.samples, self.replicates, self.lanes, self.panels)
         return PathTraceSky(atmosphere, guide.build(atmosphere), jax.random.key(self.seed), resolution)
+
+
+class Estimate(NamedTuple):
+    """Light arriving along a ray, its standard error, and the transmittance to where the ray ends."""
+
+    radiance: Radiance
+    stderr: Radiance
+    transmittance: Transmittance
 
 
 class PathTraceSky(Sky):
@@ -87,10 +96,9 @@ class PathTraceSky(Sky):
 
     def radiance_with_error(
         self, *, altitude: Altitude, view: Direction, sun: Direction, key: PRNGKeyArray | None = None
-    ) -> tuple[Radiance, Radiance, Transmittance]:
-        """Radiance, its standard error and the transmittance; arguments as for :meth:`radiance`."""
-        key = self.key if key is None else key
-        return _ask(self, altitude, view, sun, jnp.inf, key, ground=True)
+    ) -> Estimate:
+        """Radiance with its standard error; arguments as for :meth:`radiance`, another ``key`` for another sample."""
+        return _ask(self, altitude, view, sun, jnp.inf, True, self.key if key is None else key)
 
     def radiance(self, *, altitude: Altitude, view: Direction, sun: Direction) -> Ray:
         """Radiance and transmittance along unit vectors ``view`` for a sun in direction ``sun``, shapes (..., 3)."""
@@ -107,7 +115,7 @@ class PathTraceSky(Sky):
         across = jnp.sqrt(jnp.maximum((1 - mu_s) * (1 + mu_s) - along * along, 0))
         sun = jnp.stack([across, along, mu_s], axis=-1)
         reach = jnp.inf if distance is None else distance
-        light, _, transmittance = _ask(self, altitude, view, sun, reach, jax.random.fold_in(self.key, 1), ground=False)
+        light, _, transmittance = _ask(self, altitude, view, sun, reach, False, jax.random.fold_in(self.key, 1))
         return Path(light, transmittance)
 
     @eqx.filter_jit
@@ -125,58 +133,63 @@ class PathTraceSky(Sky):
         zero = jnp.zeros_like(mu_s)
         up = jnp.stack([zero, zero, zero + 1], axis=-1)
         sun = jnp.stack([zero, geometry.sine(mu_s), mu_s], axis=-1)
-        key = jax.random.fold_in(self.key, 2)
-        return _ask(self, zero, up, sun, jnp.inf, key, ground=True, hemisphere=True)[0]
+        return _ask(self, zero, up, sun, jnp.inf, True, jax.random.fold_in(self.key, 2), hemisphere=True).radiance
 
 
-@eqx.filter_jit
 def _ask(
     sky: PathTraceSky,
     altitude: Altitude,
     view: Direction,
     sun: Direction,
     reach: Length,
+    ground: bool,
     key: PRNGKeyArray,
     *,
-    ground: bool,
     hemisphere: bool = False,
-) -> tuple[Radiance, Radiance, Transmittance]:
-    """Estimate, standard error and transmittance for a batch of rays of any shape, from anywhere."""
-    atmosphere = sky.atmosphere
-    dtype = atmosphere.bottom_radius.dtype
-    altitude, reach, *components = jnp.broadcast_arrays(
-        *(jnp.asarray(x, dtype) for x in (altitude, reach)), *jnp.moveaxis(jnp.asarray(view, dtype), -1, 0),
-        *jnp.moveaxis(jnp.asarray(sun, dtype), -1, 0)
-    )  # fmt: skip
-    shape = altitude.shape
-    rays = _enter(atmosphere, altitude.ravel(), [x.ravel() for x in components], reach.ravel(), ground)
+) -> Estimate:
+    """Answer for rays of any shape, from anywhere; ``ground`` says whether light of the ground counts."""
+    components = (*jnp.moveaxis(view, -1, 0), *jnp.moveaxis(sun, -1, 0))
+    rays = jnp.broadcast_arrays(altitude, reach, ground, *components)
+    shape, dtype = rays[0].shape, sky.atmosphere.bottom_radius.dtype
+    altitude, reach, sees_ground, x, y, z, *sun_flat = (ray.ravel().astype(dtype) for ray in rays)
+    answers = _estimate(sky, altitude, (x, y, z), tuple(sun_flat), reach, sees_ground > 0, key, hemisphere)
+    return Estimate(*(answer.reshape(*shape, -1) for answer in answers))
+
+
+@eqx.filter_jit
+def _estimate(
+    sky: PathTraceSky,
+    altitude: Altitude,
+    view: Vector,
+    sun: Vector,
+    reach: Length,
+    ground: Bool[Array, " rays"],
+    key: PRNGKeyArray,
+    hemisphere: bool,
+) -> Estimate:
+    """The same for a list of rays: one compilation serves every question of its length."""
+    rays = _enter(sky.atmosphere, altitude, view, sun, reach, ground)
     mean, error = _average(sky, rays, key, hemisphere)
-    through = jnp.moveaxis(_transmittance(atmosphere, rays), 0, -1)
-    width = atmosphere.wavelengths.size
-    return mean.reshape(*shape, width), error.reshape(*shape, width), through.reshape(*shape, width)
+    return Estimate(mean, error, jnp.moveaxis(_transmittance(sky.atmosphere, rays), 0, -1))
 
 
-def _enter(atmosphere: Atmosphere, altitude: Altitude, components: list[Array], reach: Length, ground: bool) -> Rays:
+def _enter(
+    atmosphere: Atmosphere, altitude: Altitude, view: Vector, sun: Vector, reach: Length, ground: Bool[Array, " rays"]
+) -> Rays:
     """Rays that start inside the atmosphere; one that misses it starts at the top and leaves at once."""
     radius, top = atmosphere.bottom_radius, atmosphere.top_altitude
-    x, y, z = components[:3]
-    sun = (components[3], components[4], components[5])
-    nu = x * sun[0] + y * sun[1] + z * sun[2]
-    inside, _, _, moved, misses = geometry.enter_atmosphere(altitude, z, sun[2], nu, radius, top)
-    r, r_inside = radius + altitude, radius + inside
-    up = (moved * x / r_inside, moved * y / r_inside, (r + moved * z) / r_inside)
-    up = tuple(jnp.where(misses, pole, part) for pole, part in zip((0.0, 0.0, 1.0), up, strict=True))
-    view = tuple(jnp.where(misses, pole, part) for pole, part in zip(up, (x, y, z), strict=True))
-    return Rays(inside, up, view, sun, jnp.maximum(reach - moved, 0), jnp.full(altitude.shape, ground))
+    nu = vector.dot(view, sun)
+    inside, _, _, moved, misses = geometry.enter_atmosphere(altitude, view[2], sun[2], nu, radius, top)
+    pole = (jnp.zeros_like(nu), jnp.zeros_like(nu), jnp.ones_like(nu))
+    up = vector.unit(vector.combine((radius + altitude, pole), (moved, view)))
+    return Rays(inside, up, vector.where(misses, up, view), sun, jnp.maximum(reach - moved, 0), ground)
 
 
 def _transmittance(atmosphere: Atmosphere, rays: Rays) -> Float[Array, "w rays"]:
     """To the end of each ray, or as far as it reaches."""
-    mu = rays.up[0] * rays.view[0] + rays.up[1] * rays.view[1] + rays.up[2] * rays.view[2]
-    mu = jnp.clip(mu, -1, 1)
-    ray = columns.segment(
-        atmosphere, rays.altitude, mu, geometry.hits_ground(rays.altitude, mu, atmosphere.bottom_radius)
-    )
+    mu = vector.cosine(rays.up, rays.view)
+    ground = geometry.hits_ground(rays.altitude, mu, atmosphere.bottom_radius)
+    ray = columns.segment(atmosphere, rays.altitude, mu, ground)
     end = jnp.minimum(rays.reach, ray.length)
     half = jnp.full((), 0.5, mu.dtype)
     whole, _ = columns.walk(atmosphere, ray, end, half, FINE, lambda carry, _: (carry, None), None)

@@ -83,7 +83,7 @@ def _draw_place(
     count = mass.shape[0]
     even = FLOOR / count * volume
     mass = mass + jnp.where(length > 0, even, 0)
-    cumulative = jnp.einsum("mk,k...->m...", jnp.tril(jnp.ones((count, count), mass.dtype)), mass)
+    cumulative = jnp.einsum("mk,k...->m...", jnp.tril(jnp.ones((count, count), mass.dtype)), mass, precision="highest")
     everything = cumulative[-1] + light.ground
     aim = u * everything
     on_ground = (aim >= cumulative[-1]) & (light.ground > 0)
@@ -103,11 +103,8 @@ def _draw_place(
     inside = jnp.clip(safe_divide(2 * inside, 1 - slope + root), 0, 1)
     step = inside * length
 
-    def at(distance: Length) -> columns.Triple:
-        there = geometry.altitude_along(ray.altitude, ray.mu, distance, atmosphere.bottom_radius)
-        return columns.densities(atmosphere, there)
-
-    partial = columns.simpson(step, at(start), at(start + 0.5 * step), at(start + step))
+    there = geometry.altitude_along(ray.altitude, ray.mu, start, atmosphere.bottom_radius)
+    partial, _, _ = columns.over(atmosphere, ray, start, start + step, columns.densities(atmosphere, there))
     before = columns.add((pick(light.before[0]), pick(light.before[1]), pick(light.before[2])), partial)
     density = safe_divide(jnp.where(on_ground, light.ground, low + (high - low) * inside), everything)
     behind = tuple(jnp.where(on_ground, a, b) for a, b in zip(light.whole, before, strict=True))
