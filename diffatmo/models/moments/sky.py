@@ -249,7 +249,7 @@ class MomentsView(View):
         weight = weight * polar(size.degrees.first, mu_here[..., 0])[..., None]
         parts = altitude_rows, weight, sun_rows, jnp.moveaxis(around, -1, 2)
         parts = jax.tree.map(lambda part: part[:, None], parts)
-        light = jax.lax.map(lambda part: gather(sky.state.moments, *part)[0], parts)
+        light = jax.lax.map(lambda part: gather(sky.state.moments, *part, orders(size.degrees.first))[0], parts)
         return jnp.moveaxis(light, 1, 2)
 
     def _lookup(

@@ -38,6 +38,10 @@ class Degrees(NamedTuple):
     """Of the higher orders after it."""
 
 
+MAX_DEGREE = 24
+"""More than any degree in use."""
+
+
 class State(NamedTuple):
     """Moments M_lm of the radiance, and the irradiance of the ground by the sky, both divided by ``dusk``."""
 
@@ -150,53 +154,71 @@ def _first_order_at(
 
 
 def gather(
-    moments: Float[Array, "h lm w s"],
+    moments: Float[Array, "h c w s"],
     altitude_rows: Float[Array, "k n h"],
-    weight: Float[Array, "k n lm w"],
+    weight: Float[Array, "k n c w"],
     sun_rows: Float[Array, "k n s *suns"],
     azimuthal: Float[Array, "k n m *suns"],
+    m_of: np.ndarray,
 ) -> Float[Array, "k w *suns"]:
     """Light scattered towards the start of ``k`` rays: moments interpolated to their ``n`` nodes, weighted, summed.
 
-    Sums over l come first, as what depends on azimuth depends on m only.
+    Sums over l come first, as what depends on azimuth depends on m only; ``m_of`` is the m of every moment.
     """
     there = jnp.einsum("knh,hcws->kncws", altitude_rows, moments) * weight[..., None]
-    degree = azimuthal.shape[2] - 1
-    of_m = [np.flatnonzero(orders(degree) == m) for m in range(degree + 1)]
+    of_m = [np.flatnonzero(m_of == m) for m in range(m_of.max() + 1)]
     by_m = jnp.stack([sum(there[:, :, c] for c in chosen) for chosen in of_m], axis=2)
     here = jnp.einsum("knmws,kns...->knmw...", by_m, sun_rows)
-    return jnp.sum(here * azimuthal[:, :, :, None], axis=(1, 2))
+    return jnp.sum(here * azimuthal[:, :, : len(of_m), None], axis=(1, 2))
 
 
 class _Transport(eqx.Module):
-    """K: from the moments of one order of scattering to those of the next, over one set of links."""
+    """From single scattering, and from all further light, to the next order of scattering, over one set of links.
+
+    Further light is known to degree L only. Its scattering by aerosol is that of Wiscombe's delta-M method (1977, eqs. 4
+    and 9): the fraction f = χ_{L+1} of the phase function is taken for a forward peak so narrow that light in it was not
+    scattered at all, χ_l - f are the moments of the rest, and f β_M is missing from the extinction of *further* light.
+    Single scattering keeps its own phase function and its own extinction, so that what it feeds into the rest is exact.
+    """
 
     shell: Shell
     links: Links
     albedo: Float[Array, " w"]
-    weight: Float[Array, "i k n lm w"]
-    """T times (β_R χ^R_l + β_M χ^M_l) Π_lm times the quadrature weight."""
+    of_first: Float[Array, "i k n c w"]
+    """T times (β_R χ^R_l + β_M χ^M_l) Π_lm times the quadrature weight, for single scattering."""
+    of_further: Float[Array, "i k n c w"]
+    """The same for further light."""
     survives: Float[Array, "i g w"]
-    degree: int = eqx.field(static=True)
 
     @classmethod
-    def build(cls, atmosphere: Atmosphere, shell: Shell, links: Links, degree: int) -> "_Transport":
-        """Prepare for moments of ``degree``."""
+    def build(cls, atmosphere: Atmosphere, shell: Shell, links: Links, first: int, further: int) -> "_Transport":
+        """Prepare for single scattering known to degree ``first`` and all other light to degree ``further``."""
         r = links.rays
         start = jnp.broadcast_to(shell.altitude[:, None], r.mu.shape)
+        peak = phase.mie_moments(atmosphere.mie_g, further + 1, atmosphere.mie_phase)[-1]
+        thin = eqx.tree_at(lambda a: a.mie_scattering, atmosphere, (1 - peak) * atmosphere.mie_scattering)
         along, end = transmittance.columns_along(atmosphere, start, r.mu, r.nodes, r.steps)
-        view = jnp.exp(-transmittance.optical_depth(atmosphere, along)) * r.nodes.weight[..., None]
-        source = source_moments(atmosphere, r.nodes.altitude, degree)[..., degrees(degree), :] * links.polar[..., None]
-        survives = jnp.exp(-transmittance.optical_depth(atmosphere, end))[:, r.mu.shape[1] - r.mu_s_ground.shape[1] :]
-        return cls(shell, links, atmosphere.ground_albedo, view[..., None, :] * source, survives, degree)
+        view = (jnp.exp(-transmittance.optical_depth(thin, along)) * r.nodes.weight[..., None])[..., None, :]
+        survives = jnp.exp(-transmittance.optical_depth(thin, end))[:, r.mu.shape[1] - r.mu_s_ground.shape[1] :]
 
-    def apply(self, state: State, degree: int) -> State:
+        def weight(degree: int, peak: Scalar | float) -> Float[Array, "i k n c w"]:
+            source = source_moments(atmosphere, r.nodes.altitude, degree, peak)[..., degrees(degree), :]
+            return view * source * links.polar[..., : len(pairs(degree)), None]
+
+        return cls(shell, links, atmosphere.ground_albedo, weight(first, 0.0), weight(further, peak), survives)
+
+    def apply(self, first: State | None, further: State | None, degree: int) -> State:
         """The next order; its moments to ``degree``."""
+        given = [(s, w) for s, w in ((first, self.of_first), (further, self.of_further)) if s is not None]
+        moments = jnp.concatenate([state.moments for state, _ in given], axis=1)
+        weight = jnp.concatenate([weight for _, weight in given], axis=3)
+        m_of = np.concatenate([orders(MAX_DEGREE)[: weight.shape[3]] for _, weight in given])
+        irradiance = sum(state.irradiance for state, _ in given)
         links, r = self.links, self.links.rays
-        parts = links.altitude_rows, self.weight, links.sun_rows, links.azimuthal
+        parts = links.altitude_rows, weight, links.sun_rows, links.azimuthal
         # One altitude node after another: the temporary arrays stay in the cache.
-        radiance = jax.lax.map(lambda part: gather(state.moments, *part), parts)
-        falling = jnp.einsum("ws,igspj->igwpj", state.irradiance, links.ground_rows)
+        radiance = jax.lax.map(lambda part: gather(moments, *part, m_of), parts)
+        falling = jnp.einsum("ws,igspj->igwpj", irradiance, links.ground_rows)
         reflected = (self.albedo / jnp.pi * self.survives)[..., None, None] * falling
         radiance = radiance + _below(reflected, r.mu.shape[1] - reflected.shape[1], axis=1)
         harmonics = _harmonics(degree, cosines(r.azimuths, radiance.dtype))
@@ -204,12 +226,19 @@ class _Transport(eqx.Module):
         return State(_moments(r, by_order, degree), _irradiance(r, by_order[:, 0]))
 
 
-def source_moments(atmosphere: Atmosphere, altitude: Altitude, degree: int) -> Float[Array, "... l w"]:
-    """β_R(h) χ^R_l + β_M(h) χ^M_l, km^-1, for l = 0 … degree."""
+def source_moments(
+    atmosphere: Atmosphere, altitude: Altitude, degree: int, peak: Scalar | float = 0.0
+) -> Float[Array, "... l w"]:
+    """β_R(h) χ^R_l + β_M(h) (χ^M_l - peak), km^-1, for l = 0 … degree."""
     air = jnp.asarray(phase.rayleigh_moments(degree), altitude.dtype)[:, None] * atmosphere.rayleigh_scattering
-    aerosol = phase.mie_moments(atmosphere.mie_g, degree, atmosphere.mie_phase)[:, None] * atmosphere.mie_scattering
+    moments = phase.mie_moments(atmosphere.mie_g, degree, atmosphere.mie_phase) - peak
+    aerosol = moments[:, None] * atmosphere.mie_scattering
     densities = transmittance.exponentials(transmittance.scale_heights(atmosphere), altitude)[..., None, None]
     return densities[0] * air + densities[1] * aerosol
+
+
+def _add(a: State, b: State) -> State:
+    return State(a.moments + b.moments, a.irradiance + b.irradiance)
 
 
 def solve(atmosphere: Atmosphere, shell: Shell, *, order: int, degrees_: Degrees, peak_azimuths: int) -> State:
@@ -218,23 +247,25 @@ def solve(atmosphere: Atmosphere, shell: Shell, *, order: int, degrees_: Degrees
     Orders of scattering up to ``order`` are computed one by one, the rest is a geometric tail.
     """
     first = _first_order(atmosphere, shell, degrees_.first, peak_azimuths)
-    seed = State(first.moments[:, : len(pairs(degrees_.iterate))], first.irradiance)
-    transport = _Transport.build(atmosphere, shell, shell.iterate, degrees_.iterate)
+    low = degrees_.iterate
+
+    def seed(degree: int) -> State:
+        return State(first.moments[:, : len(pairs(degree))], first.irradiance)
+
+    transport = _Transport.build(atmosphere, shell, shell.iterate, low, low)
+    second = transport.apply(seed(low), None, low)
 
     def next_order(carry: tuple[State, State, State], _: None) -> tuple[tuple[State, State, State], None]:
         total, term, _previous = carry
-        following = transport.apply(term, degrees_.iterate)
-        total = State(total.moments + following.moments, total.irradiance + following.irradiance)
-        return (total, following, term), None
+        following = transport.apply(None, term, low)
+        return (_add(total, following), following, term), None
 
-    (total, term, previous), _ = jax.lax.scan(next_order, (seed, seed, seed), None, length=order - 1)
+    (total, term, previous), _ = jax.lax.scan(next_order, (second, second, second), None, length=order - 2)
     # Geometric tail: far along the series each order is the one before times a ratio, here that of the mean radiance.
     tail = _tail(term.moments[:, :1], previous.moments[:, :1])
     ground_tail = _tail(term.irradiance, previous.irradiance)
-    total = State(total.moments + tail * term.moments, total.irradiance + ground_tail * term.irradiance)
-    # What the iteration has of low degree, and what single scattering has of higher: the source of the last gather.
-    moments = first.moments[:, : len(pairs(degrees_.source))].at[:, : total.moments.shape[1]].set(total.moments)
-    gather = _Transport.build(atmosphere, shell, shell.last, degrees_.source)
-    beyond = gather.apply(State(moments, total.irradiance), degrees_.last)
+    total = _add(total, State(tail * term.moments, ground_tail * term.irradiance))
+    last = _Transport.build(atmosphere, shell, shell.last, degrees_.source, low)
+    beyond = last.apply(seed(degrees_.source), total, degrees_.last)
     kept = beyond.moments.shape[1]
     return State(first.moments.at[:, :kept].add(beyond.moments), first.irradiance + beyond.irradiance)
