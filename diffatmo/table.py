@@ -23,29 +23,33 @@ def unstretch(value: Float[Array, "..."], linear: float) -> Float[Array, "..."]:
     return 2 * value / (linear + safe_sqrt(linear * linear + 4 * (1 - linear) * value))
 
 
-def cubic_weights(unit: Float[Array, "..."], count: int) -> tuple[Int[Array, "..."], Float[Array, "... 4"]]:
-    """First node and the four Lagrange weights for interpolation at ``unit`` in ``count`` equidistant nodes on [0, 1]."""
+def _cubic(unit: Float[Array, "..."], count: int) -> tuple[Int[Array, "..."], tuple[Float[Array, "..."], ...]]:
     position = unit * (count - 1)
     first = jnp.clip(jnp.floor(position).astype(jnp.int32) - 1, 0, count - 4)
     t = position - first
-    weights = (
+    return first, (
         (t - 1) * (t - 2) * (3 - t) / 6,
         t * (t - 2) * (t - 3) / 2,
         t * (t - 1) * (3 - t) / 2,
         t * (t - 1) * (t - 2) / 6,
     )
+
+
+def cubic_weights(unit: Float[Array, "..."], count: int) -> tuple[Int[Array, "..."], Float[Array, "... 4"]]:
+    """First node and the four Lagrange weights for interpolation at ``unit`` in ``count`` equidistant nodes on [0, 1]."""
+    first, weights = _cubic(unit, count)
     return first, jnp.stack(weights, axis=-1)
 
 
 def cubic_rows(unit: Float[Array, "..."], count: int, axis: int = -1) -> Float[Array, "... n"]:
     """The same weights as dense rows over all nodes, on a new ``axis``, for interpolation by matrix product."""
-    first, weights = cubic_weights(unit, count)
+    first, weights = _cubic(unit, count)
     axis = axis % (unit.ndim + 1)
     nodes = jnp.expand_dims(jnp.arange(count), [a for a in range(unit.ndim + 1) if a != axis])
     offset = nodes - jnp.expand_dims(first, axis)
     rows = jnp.zeros((), unit.dtype)
-    for number in range(4):
-        rows = jnp.where(offset == number, jnp.expand_dims(weights[..., number], axis), rows)
+    for number, weight in enumerate(weights):
+        rows = jnp.where(offset == number, jnp.expand_dims(weight, axis), rows)
     return rows
 
 

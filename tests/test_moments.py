@@ -8,7 +8,7 @@ import pytest
 
 from diffatmo.atmosphere import earth
 from diffatmo.models.moments import Moments
-from diffatmo.models.moments.angular import azimuthal, norms, orders, pairs, polar
+from diffatmo.models.moments.angular import azimuthal, norms, orders, pairs, plane, polar
 from diffatmo.models.raymarch import RayMarch
 
 
@@ -132,7 +132,12 @@ def test_angular_functions_are_the_spherical_harmonics_addition_theorem(x64):
     a, b = rng.normal(size=(2, 50, 3))
     a, b = a / np.linalg.norm(a, axis=-1, keepdims=True), b / np.linalg.norm(b, axis=-1, keepdims=True)
     mu, mu_s, nu = jnp.asarray(a[:, 2]), jnp.asarray(b[:, 2]), jnp.sum(jnp.asarray(a * b), -1)
-    terms = norms(8) * polar(8, mu) * polar(8, mu_s) * azimuthal(8, mu, mu_s, nu)[..., orders(8)]
+    terms = (
+        norms(8)
+        * polar(8, mu)
+        * polar(8, mu_s)
+        * jnp.stack(azimuthal(8, *plane(mu, mu_s, nu)), axis=-1)[..., orders(8)]
+    )
     for order in range(9):
         chosen = np.array([pair[0] == order for pair in pairs(8)])
         legendre = np.polynomial.legendre.legval(np.asarray(nu), np.eye(9)[order])

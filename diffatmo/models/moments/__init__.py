@@ -14,9 +14,10 @@ C_m is a polynomial in w = nu - mu mu_s and q = (1 - mu²)(1 - mu_s²), so nothi
 the zenith is a point like any other, for value and derivative.
 
 1. First order: exact phase functions along every ray (:mod:`diffatmo.scattering`); its moments seed the iteration.
-2. Each further order is linear in the last, M ← M¹ + K M: for every (h, mu_s) node and direction, integrate T J to the ground
-   or the top, add the Lambertian ground, project. Positions, weights and polynomials depend on the planet only
-   (:mod:`.shell`); T and β are the parameters' (:mod:`.solve`). A geometric tail closes the series.
+2. Each further order is linear in the last: for every (h, mu_s) node and direction, integrate T J to the ground or the top,
+   add the Lambertian ground, project. Positions, weights and polynomials depend on the planet only (:mod:`.shell`); T and β
+   are the parameters' (:mod:`.solve`). What is kept is of low degree, and the aerosol's peak beyond it is treated by the
+   delta-M method (Wiscombe 1977). A geometric tail closes the series.
 3. One last gather along the rays of the image, with the moments of the first order to a high degree (:mod:`.sky`).
 4. Repeated forward scattering beyond that degree (the aureole): Σ_{n≥2} β_M T_sun τ^{n-1}/(n-1)! [P^(n) - its truncation].
 """
@@ -36,13 +37,13 @@ class Moments(Model):
 
     altitudes: int = 16
     suns: int = 24
-    first: Directions = Directions(sky=14, ground=6, azimuths=5, steps=5, degree=8)
-    iterate: Directions = Directions(sky=8, ground=5, azimuths=3, steps=6, degree=2)
-    last: Directions = Directions(sky=10, ground=6, azimuths=7, steps=6, degree=6)
+    first: Directions = Directions(sky=12, ground=6, azimuths=6, steps=8, degree=10)
+    iterate: Directions = Directions(sky=6, ground=4, azimuths=4, steps=5, degree=3)
+    last: Directions = Directions(sky=8, ground=5, azimuths=8, steps=5, degree=8)
     source_degree: int = 4
     peak_azimuths: int = 32
     order: int = 5
-    view_steps: int = 8
+    view_steps: int = 10
     view_sky: int = 48
     view_ground: int = 20
     view_columns: int = 16

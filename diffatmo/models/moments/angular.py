@@ -54,14 +54,17 @@ def polar(degree: int, mu: Cosine) -> Float[Array, "... lm"]:
     return table.chebyshev(degree + 1, mu) @ jnp.asarray(_expansion(degree), mu.dtype)
 
 
-def azimuthal(degree: int, mu: Cosine, mu_s: Cosine, nu: Cosine) -> Float[Array, "... m"]:
-    """C_m(w, q) = (sinθ sinθ_s)^m cos(m φ) for m = 0 … degree."""
-    w = nu - mu * mu_s
-    q = (1 - mu * mu) * (1 - mu_s * mu_s)
+def plane(mu: Cosine, mu_s: Cosine, nu: Cosine) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    """w = sinθ sinθ_s cos φ and q = (sinθ sinθ_s)²."""
+    return nu - mu * mu_s, (1 - mu * mu) * (1 - mu_s * mu_s)
+
+
+def azimuthal(degree: int, w: Float[Array, "..."], q: Float[Array, "..."]) -> list[Float[Array, "..."]]:
+    """C_m(w, q) = (sinθ sinθ_s)^m cos(m φ) for m = 0 … degree: multiples of an angle without the angle."""
     multiple = [jnp.ones_like(w), w]
     for _ in range(2, degree + 1):
         multiple.append(2 * w * multiple[-1] - q * multiple[-2])
-    return jnp.stack(multiple[: degree + 1], axis=-1)
+    return multiple[: degree + 1]
 
 
 def projection(degree: int, mu: Cosine) -> Float[Array, "... lm"]:

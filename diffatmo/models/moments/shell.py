@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool, Float
 
 from diffatmo import geometry, rays, table
 from diffatmo._types import Altitude, Cosine, Scalar
-from diffatmo.models.moments.angular import azimuthal, cosines, orders, polar, projection, relative_nu
+from diffatmo.models.moments.angular import cosines, orders, plane, polar, projection, relative_nu
 from diffatmo.numerics import gauss_legendre, safe_divide, safe_sqrt
 
 ALTITUDE_LINEAR = 0.04
@@ -99,18 +99,31 @@ class Rays(eqx.Module):
         )
 
 
+class Ways(NamedTuple):
+    """What takes moments at the nodes of the shell to the light scattered along ``k`` rays.
+
+    The weights of the interpolation in the sun's height are made from ``sun_unit`` where they are used: as a table they would
+    be the largest array by far. ``suns`` stands for one or more axes over suns; in :class:`Links` axis ``i`` comes first.
+    """
+
+    altitude_rows: Float[Array, "..."]
+    """Interpolation in altitude; k n h."""
+    sun_unit: Float[Array, "..."]
+    """Unit coordinate of the sun's height at the nodes along the ray; k n suns, as what follows."""
+    dusk: Float[Array, "..."]
+    w: Float[Array, "..."]
+    """sinθ sinθ_s cos φ."""
+    q: Float[Array, "..."]
+    """(sinθ sinθ_s)²."""
+
+
 class Links(eqx.Module):
     """Rays with everything that takes moments at the nodes to the source along the rays."""
 
     rays: Rays
-    altitude_rows: Float[Array, "i k n h"]
-    """Interpolation in altitude."""
-    sun_rows: Float[Array, "i k n s p j"]
-    """Interpolation in the sun's height, times ``dusk`` there."""
+    ways: Ways
     polar: Float[Array, "i k n lm"]
     """Π_lm in the direction of the ray."""
-    azimuthal: Float[Array, "i k n m p j"]
-    """C_m in the direction of the ray."""
     ground_rows: Float[Array, "i g s p j"]
     """Interpolation of the ground's irradiance where the ray ends."""
 
@@ -187,20 +200,18 @@ def _link(
     start = jnp.broadcast_to(altitude[:, None, None], r.nodes.altitude.shape)
     mu_here = geometry.mu_along(start, r.mu[..., None], r.nodes.distance, radius)
     nu = relative_nu(r.mu[..., None, None], mu_s, cosines(count.azimuths, altitude.dtype)[:, None])
-    here = jnp.broadcast_to(mu_here[..., None, None], r.mu_s_here.shape)
-    around = azimuthal(degree, here, r.mu_s_here, nu[:, :, None])
-
-    def sun_rows(value: Cosine) -> Float[Array, "... s p j"]:
-        rows = table.cubic_rows(sun_unit(value, radius, top), mu_s.size, axis=-3)
-        return rows * dusk(value, grazing(radius, top))[..., None, :, :]
-
+    scale = grazing(radius, top)
+    ground_rows = table.cubic_rows(sun_unit(r.mu_s_ground, radius, top), mu_s.size, axis=2)
     return Links(
         rays=r,
-        altitude_rows=table.cubic_rows(altitude_unit(r.nodes.altitude, top), altitude.size),
-        sun_rows=sun_rows(r.mu_s_here),
+        ways=Ways(
+            table.cubic_rows(altitude_unit(r.nodes.altitude, top), altitude.size),
+            sun_unit(r.mu_s_here, radius, top),
+            dusk(r.mu_s_here, scale),
+            *plane(mu_here[..., None, None], r.mu_s_here, nu[:, :, None]),
+        ),
         polar=polar(degree, mu_here),
-        azimuthal=jnp.moveaxis(around, -1, -3),
-        ground_rows=sun_rows(r.mu_s_ground),
+        ground_rows=ground_rows * dusk(r.mu_s_ground, scale)[:, :, None],
     )
 
 

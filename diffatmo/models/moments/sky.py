@@ -12,8 +12,8 @@ from diffatmo import geometry, phase, rays, scattering, table, transmittance
 from diffatmo._types import Altitude, Cosine, Direction, Irradiance, Length, Scalar, Transmittance
 from diffatmo.atmosphere import Atmosphere
 from diffatmo.models.base import Path, Ray, Sky, View
-from diffatmo.models.moments.angular import azimuthal, degrees, orders, polar
-from diffatmo.models.moments.shell import Shell, dusk
+from diffatmo.models.moments.angular import azimuthal, degrees, orders, plane, polar
+from diffatmo.models.moments.shell import Shell, Ways, dusk
 from diffatmo.models.moments.solve import Degrees, State, gather, source_moments
 from diffatmo.numerics import safe_divide, safe_sqrt
 
@@ -86,7 +86,8 @@ class MomentsSky(Sky):
         moments = table.interpolate(by_position, *position).reshape(*mu_here.shape, count, w)
         moments = moments * dusk(mu_s_here, self.shell.grazing())[..., None, None]
         degree = self.resolution.degrees.first
-        angular = polar(degree, mu_here) * azimuthal(degree, mu_here, mu_s_here, nu[..., None])[..., orders(degree)]
+        around = azimuthal(degree, *plane(mu_here, mu_s_here, nu[..., None]))
+        angular = polar(degree, mu_here) * jnp.stack(around, axis=-1)[..., orders(degree)]
         source = jnp.sum(moments * self._source(nodes.altitude) * angular[..., None], axis=-2)
         light = light + jnp.sum(self._survival(altitude, mu, nodes, steps) * source, axis=-2)
         return Path(jnp.where(misses[..., None], 0, light), jnp.where(misses[..., None], 1, single.transmittance))
@@ -236,20 +237,23 @@ class MomentsView(View):
         """
         size, shell = sky.resolution, sky.shell
         radius, top = sky.atmosphere.bottom_radius, sky.atmosphere.top_altitude
-        i, j = sky.state.moments.shape[0], sky.state.moments.shape[-1]
         nodes = rays.trace(altitude, mu, ground, radius, top, size.steps)
         at = (altitude[:, None, None], mu[:, None, None])
         distance = nodes.distance[..., None]
         mu_here = geometry.mu_along(*at, distance, radius)
         mu_s_here = geometry.mu_s_along(*at, mu_s[:, None], nu[:, None], distance, radius)
-        altitude_rows = table.cubic_rows(shell.altitude_unit(nodes.altitude), i)
-        sun_rows = table.cubic_rows(shell.sun_unit(mu_s_here), j, axis=2) * dusk(mu_s_here, shell.grazing())[:, :, None]
-        around = azimuthal(size.degrees.first, mu_here, mu_s_here, nu[:, None])
+        altitude_rows = table.cubic_rows(shell.altitude_unit(nodes.altitude), shell.altitude.size)
+        ways = Ways(
+            altitude_rows,
+            shell.sun_unit(mu_s_here),
+            dusk(mu_s_here, shell.grazing()),
+            *plane(mu_here, mu_s_here, nu[:, None]),
+        )
         weight = sky._source(nodes.altitude) * sky._survival(altitude, mu, nodes, size.steps)[..., None, :]
         weight = weight * polar(size.degrees.first, mu_here[..., 0])[..., None]
-        parts = altitude_rows, weight, sun_rows, jnp.moveaxis(around, -1, 2)
-        parts = jax.tree.map(lambda part: part[:, None], parts)
-        light = jax.lax.map(lambda part: gather(sky.state.moments, *part, orders(size.degrees.first))[0], parts)
+        parts = jax.tree.map(lambda part: part[:, None], (ways, weight))
+        m_of = orders(size.degrees.first)
+        light = jax.lax.map(lambda part: gather(sky.state.moments, part[0], part[1], m_of)[0], parts)
         return jnp.moveaxis(light, 1, 2)
 
     def _lookup(

@@ -16,8 +16,8 @@ from jaxtyping import Array, Float
 from diffatmo import phase, table, transmittance
 from diffatmo._types import Altitude, Scalar
 from diffatmo.atmosphere import Atmosphere
-from diffatmo.models.moments.angular import cosines, degrees, orders, pairs, relative_nu
-from diffatmo.models.moments.shell import Links, Rays, Shell
+from diffatmo.models.moments.angular import azimuthal, cosines, degrees, orders, pairs, relative_nu
+from diffatmo.models.moments.shell import Links, Rays, Shell, Ways
 from diffatmo.numerics import per_parameter, safe_divide
 from diffatmo.rays import PIECES, Nodes
 
@@ -154,22 +154,20 @@ def _first_order_at(
 
 
 def gather(
-    moments: Float[Array, "h c w s"],
-    altitude_rows: Float[Array, "k n h"],
-    weight: Float[Array, "k n c w"],
-    sun_rows: Float[Array, "k n s *suns"],
-    azimuthal: Float[Array, "k n m *suns"],
-    m_of: np.ndarray,
+    moments: Float[Array, "h c w s"], ways: Ways, weight: Float[Array, "k n c w"], m_of: np.ndarray
 ) -> Float[Array, "k w *suns"]:
     """Light scattered towards the start of ``k`` rays: moments interpolated to their ``n`` nodes, weighted, summed.
 
     Sums over l come first, as what depends on azimuth depends on m only; ``m_of`` is the m of every moment.
     """
-    there = jnp.einsum("knh,hcws->kncws", altitude_rows, moments) * weight[..., None]
-    of_m = [np.flatnonzero(m_of == m) for m in range(m_of.max() + 1)]
-    by_m = jnp.stack([sum(there[:, :, c] for c in chosen) for chosen in of_m], axis=2)
+    there = jnp.einsum("knh,hcws->kncws", ways.altitude_rows, moments) * weight[..., None]
+    degree = m_of.max()
+    by_m = jnp.stack([sum(there[:, :, c] for c in np.flatnonzero(m_of == m)) for m in range(degree + 1)], axis=2)
+    sun_rows = table.cubic_rows(ways.sun_unit, moments.shape[-1], axis=2) * ways.dusk[:, :, None]
     here = jnp.einsum("knmws,kns...->knmw...", by_m, sun_rows)
-    return jnp.sum(here * azimuthal[:, :, : len(of_m), None], axis=(1, 2))
+    around = azimuthal(degree, ways.w, ways.q)
+    # One sum over m inside, one over n outside: a sum for each m would go through the arrays as often.
+    return jnp.sum(sum(here[:, :, m] * around[m][:, :, None] for m in range(degree + 1)), axis=1)
 
 
 class _Transport(eqx.Module):
@@ -215,9 +213,8 @@ class _Transport(eqx.Module):
         m_of = np.concatenate([orders(MAX_DEGREE)[: weight.shape[3]] for _, weight in given])
         irradiance = sum(state.irradiance for state, _ in given)
         links, r = self.links, self.links.rays
-        parts = links.altitude_rows, weight, links.sun_rows, links.azimuthal
         # One altitude node after another: the temporary arrays stay in the cache.
-        radiance = jax.lax.map(lambda part: gather(moments, *part, m_of), parts)
+        radiance = jax.lax.map(lambda part: gather(moments, part[0], part[1], m_of), (links.ways, weight))
         falling = jnp.einsum("ws,igspj->igwpj", irradiance, links.ground_rows)
         reflected = (self.albedo / jnp.pi * self.survives)[..., None, None] * falling
         radiance = radiance + _below(reflected, r.mu.shape[1] - reflected.shape[1], axis=1)
