@@ -28,7 +28,8 @@ class Problem(eqx.Module):
     """All that the residuals depend on besides ``y``.
 
     ``weight`` is 1/sigma, and 0 for pixels that are not used; ``shell`` is what the model knows of the planet alone, if
-    it makes use of that and the planet is not free.
+    it makes use of that and the planet is not free. ``correction`` is what a finer model says, over what this one says, at
+    one point near the optimum; it scales the radiance and its derivatives.
     """
 
     model: Model
@@ -36,6 +37,7 @@ class Problem(eqx.Module):
     batch: Batch
     weight: Predicted
     shell: Any = None
+    correction: Predicted | None = None
 
     def sky(self, coordinates: Coordinates) -> Sky:
         """The sky at coordinates of the atmosphere."""
@@ -43,6 +45,11 @@ class Problem(eqx.Module):
         if isinstance(self.model, Moments) and self.shell is not None:
             return self.model.sky(atmosphere, self.shell)
         return self.model.sky(atmosphere)
+
+    def radiance(self, coordinates: Coordinates) -> Predicted:
+        """Radiance of all pixels, by the finer model if there is a correction."""
+        radiance = predict(self.sky(coordinates), self.batch)
+        return radiance if self.correction is None else radiance * self.correction
 
     def split(self, y: Coordinates) -> tuple[Coordinates, Float[Array, " e"]]:
         """The coordinates of the atmosphere, and the logarithms of the exposures."""
@@ -89,18 +96,15 @@ def linearise(coordinates: Coordinates, problem: Problem) -> Linearisation:
     """The costly part: the model and its forward derivatives at the atmosphere's ``coordinates``."""
     colour, _ = problem.parameters.colours()
 
-    def radiance(c: Coordinates) -> Predicted:
-        return predict(problem.sky(c), problem.batch)
-
     seeds = jnp.asarray(colour == np.arange(colour.max() + 1)[:, None], dtype=coordinates.dtype)
-    tangent = jax.vmap(lambda seed: jax.jvp(radiance, (coordinates,), (seed,)), out_axes=(None, -1))
+    tangent = jax.vmap(lambda seed: jax.jvp(problem.radiance, (coordinates,), (seed,)), out_axes=(None, -1))
     return Linearisation(*tangent(seeds))
 
 
 def residuals(y: Coordinates, problem: Problem) -> Float[Array, " residual"]:
     """(expected - measured) / sigma of every pixel and channel; 0 for those not used."""
     coordinates, log_factors = problem.split(y)
-    radiance = predict(problem.sky(coordinates), problem.batch)
+    radiance = problem.radiance(coordinates)
     return _whiten(radiance * problem.batch.exposure(log_factors), problem).reshape(-1)
 
 
@@ -127,6 +131,29 @@ def jacobian(
     slope = jnp.concatenate([of_atmosphere, of_exposure], axis=-1)
     slope = jnp.where(batch.used[..., None, None], slope, 0) * problem.weight[..., None]
     return _whiten(expected, problem).reshape(-1), slope.reshape(-1, y.size)
+
+
+def smooth_fields(batch: Batch, degree: int) -> Float[np.ndarray, "image pixel b"]:
+    """Polynomials of the view direction, orthogonal over the used pixels of each image, of mean square one there.
+
+    A sum of them with independent coefficients of variance s²/b is a random smooth function on the sky of variance s².
+    """
+    directions = np.asarray(batch.directions, dtype=np.float64)
+    powers = [
+        (i, j, k) for i in range(degree + 1) for j in range(degree + 1 - i) for k in range(min(2, degree + 1 - i - j))
+    ]
+    monomials = np.stack([np.prod(directions**power, axis=-1) for power in np.array(powers, float)], axis=-1)
+    used = np.asarray(batch.used)[..., None]
+    orthogonal = np.stack([np.linalg.qr(field)[0] for field in np.where(used, monomials, 0)])
+    return orthogonal * np.sqrt(used.sum(axis=1, keepdims=True))
+
+
+def projected(
+    slope: Float[Array, "residual n"], expected: Predicted, fields: Float[Array, "image pixel b"], problem: Problem
+) -> Float[Array, "image w b n"]:
+    """Jᵀ of the residuals that a relative error of the radiance by each of ``fields``, in one image and channel, causes."""
+    by_pixel = slope.reshape(*expected.shape, -1)
+    return jnp.einsum("ipwn,ipw,ipb->iwbn", by_pixel, expected * problem.weight, fields)
 
 
 def triangle(residual: Float[Array, " residual"], slope: Float[Array, "residual n"]) -> Float[Array, "n+1 n+1"]:

@@ -5,6 +5,9 @@ Around the optimum the whitened residuals are linear in the coordinates y, so th
 (the delta method). This linear algebra is a few numbers only and is done in float64 on the host, on columns scaled to
 length one.
 
+To this is added what errors of the model itself do to the parameters (:attr:`fitting.solve.Solution.model_error`). They are
+not noise: no number of pixels averages them out, and in a good image they are the larger part.
+
 A combination of coordinates that changes no residual beyond rounding is not determined: it is left out of the
 inverse, and every number that would move along it gets no standard error at all.
 
@@ -27,10 +30,7 @@ from diffatmo.models import Model, Moments
 from fitting._errors import FitError
 from fitting.observation import Observation, sigma, unstack
 from fitting.parameters import Coordinates, derived_fields, numbers, quantities
-from fitting.solve import MAX_STEPS, TOLERANCE, Progress, Solution, Step, solve
-
-RANK_TOLERANCE = 3e-5
-"""Singular values of the scaled R below this are rounding: J is computed in float32."""
+from fitting.solve import MAX_STEPS, RANK_TOLERANCE, TOLERANCE, Progress, Solution, Step, solve
 
 
 @dataclass(frozen=True)
@@ -180,7 +180,7 @@ def summarise(solution: Solution, observations: Sequence[Observation]) -> FitRes
     covariance, determined = propagate(solution.triangle[:-1, :-1], gradient)
     reduced_chi2 = solution.chi2 / max(solution.degrees_of_freedom, 1)
     scale = max(1.0, math.sqrt(reduced_chi2))
-    covariance *= scale**2
+    covariance = scale**2 * covariance + gradient @ solution.model_error @ gradient.T
     errors = [math.sqrt(v) if ok else None for v, ok in zip(np.diag(covariance), determined, strict=True)]
     initial = np.asarray(numbers(parameters.init, free + derived), dtype=float)
     at_bound = parameters.at_bound(solution.y[:count])

@@ -49,6 +49,35 @@ class Moments(Model):
     view_columns: int = 16
     view_fine_columns: int = 32
 
+    def finer(self) -> "Moments":
+        """The same model at a higher resolution: some 0.05 % from Monte Carlo by day, 0.1 % at dusk, ten times the cost."""
+
+        def more(count: Directions) -> Directions:
+            degree = count.degree + 2 + count.degree // 5
+            return Directions(
+                sky=3 * count.sky // 2 + 1,
+                ground=3 * count.ground // 2,
+                azimuths=count.azimuths + degree - count.degree,
+                steps=count.steps + 3,
+                degree=degree,
+            )
+
+        return Moments(
+            altitudes=3 * self.altitudes // 2,
+            suns=4 * self.suns // 3,
+            first=more(self.first),
+            iterate=more(self.iterate),
+            last=more(self.last),
+            source_degree=2 * self.source_degree,
+            peak_azimuths=self.peak_azimuths,
+            order=self.order,
+            view_steps=self.view_steps + 4,
+            view_sky=4 * self.view_sky // 3,
+            view_ground=self.view_ground + 4,
+            view_columns=self.view_columns + 8,
+            view_fine_columns=3 * self.view_fine_columns // 2,
+        )
+
     def shell(self, *, bottom_radius: Scalar, top_altitude: Scalar) -> Shell:
         """Geometry of a planet (km): nodes, rays and interpolation weights. A fit computes it once."""
         return build(
