@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from diffatmo import atmosphere, scene, sun
+from diffatmo._types import Direction
 from diffatmo.camera import Equirectangular
 from diffatmo.models import PathTrace
 from diffatmo.render import Scene
@@ -24,8 +25,8 @@ HEIGHT, WIDTH = 48, 96
 ALTITUDE_KM = 0.1
 SUN_ZENITH_DEG = (35.0, 65.0, 82.0, 93.0)
 SAMPLES = 4096
-ELECTRONS = 10000.0
-"""At the mean of a picture: photon noise of 1 %."""
+ELECTRONS = 2500.0
+"""At the mean of a picture: photon noise of 2 %."""
 READ = 10.0
 """Electrons, standard deviation."""
 FREE = (
@@ -83,9 +84,35 @@ def start(truth: atmosphere.Atmosphere) -> atmosphere.Atmosphere:
     return eqx.tree_at(lambda a: [getattr(a, name) for name in FREE], truth, [values[name] for name in FREE])
 
 
+def camera() -> Equirectangular:
+    """That of all pictures: the upper half of the sky."""
+    return Equirectangular(height=HEIGHT, width=WIDTH, upper=True)
+
+
+def towards(zenith_deg: float) -> Direction:
+    """The sun of a picture."""
+    return sun.direction(zenith=jnp.radians(zenith_deg), azimuth=jnp.radians(30.0))
+
+
+def trace(truth: atmosphere.Atmosphere, zenith_deg: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and standard error of a picture, without the noise of a sensor."""
+    sky = PathTrace(samples=SAMPLES, seed=seed).sky(truth)
+    mean, error, _ = sky.radiance_with_error(
+        altitude=jnp.asarray(ALTITUDE_KM), view=camera().directions(), sun=towards(zenith_deg)
+    )
+    return np.asarray(mean, float), np.asarray(error, float)
+
+
+def expose(mean: np.ndarray, seed: int) -> tuple[np.ndarray, float]:
+    """A picture as a linear sensor sees it, and its electrons per unit of radiance."""
+    gain = ELECTRONS / mean.mean()
+    rng = np.random.default_rng(seed)
+    electrons = rng.poisson(gain * mean) + rng.normal(0, READ, mean.shape)
+    return (electrons / gain).astype(np.float32), float(gain)
+
+
 def main(directory: Path) -> None:
     """Write every picture, its scene file, its truth and its start."""
-    camera = Equirectangular(height=HEIGHT, width=WIDTH, upper=True)
     for index, (name, truth) in enumerate(ATMOSPHERES.items()):
         folder = directory / name
         folder.mkdir(parents=True, exist_ok=True)
@@ -94,27 +121,20 @@ def main(directory: Path) -> None:
         tables = []
         for number, zenith_deg in enumerate(SUN_ZENITH_DEG):
             seed = 100 * index + number
-            towards = sun.direction(zenith=jnp.radians(zenith_deg), azimuth=jnp.radians(30.0))
-            model = PathTrace(samples=SAMPLES, seed=seed)
-            mean, error, _ = model.sky(truth).radiance_with_error(
-                altitude=jnp.asarray(ALTITUDE_KM), view=camera.directions(), sun=towards
-            )
-            mean, error = np.asarray(mean, float), np.asarray(error, float)
-            gain = ELECTRONS / mean.mean()
-            rng = np.random.default_rng(seed)
-            electrons = rng.poisson(gain * mean) + rng.normal(0, READ, mean.shape)
+            mean, error = trace(truth, zenith_deg, seed)
             relative = float(np.sqrt(np.mean((error / mean) ** 2)))
+            image, gain = expose(mean, seed)
             file = f"sky_{zenith_deg:.0f}.exr"
             scene.save(
                 folder / file,
-                (electrons / gain).astype(np.float32),
-                Scene(truth, camera, ALTITUDE_KM, towards),
+                image,
+                Scene(truth, camera(), ALTITUDE_KM, towards(zenith_deg)),
                 notes={
                     "model": "pathtrace",
                     "samples": SAMPLES,
                     "seed": seed,
                     "monte_carlo_relative_standard_error": relative,
-                    "electrons_per_unit": float(gain),
+                    "electrons_per_unit": gain,
                     "read_noise_electrons": READ,
                 },
                 overwrite=True,

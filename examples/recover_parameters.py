@@ -1,5 +1,7 @@
 """Photograph a sky three times, then recover the parameters of its atmosphere from the pictures.
 
+The pictures are made by Monte Carlo, so that the model that fits them has no part in them.
+
 python examples/recover_parameters.py
 """
 
@@ -14,7 +16,9 @@ import fitting
 from diffatmo import render, sun
 from fitting import report
 
-NOISE = 0.01
+NOISE = 0.02
+MONTE_CARLO = 0.007
+"""Standard error of the path tracer, relative to a pixel."""
 
 
 def main(width: str = "64") -> fitting.FitResult:
@@ -24,10 +28,17 @@ def main(width: str = "64") -> fitting.FitResult:
     observations = []
     for zenith in (30, 70, 88):
         towards = sun.direction(zenith=np.radians(zenith), azimuth=0.0)
-        radiance = render.render(diffatmo.Scene(truth, camera, 0.1, towards))
+        radiance = render.render(diffatmo.Scene(truth, camera, 0.1, towards), model=diffatmo.PathTrace(samples=1024))
         pixels = np.asarray(radiance) * (1 + NOISE * rng.standard_normal(radiance.shape))
         observations.append(
-            fitting.observe(pixels, camera=camera, altitude=0.1, sun=towards, noise=NOISE, name=f"sun at {zenith}°")
+            fitting.observe(
+                pixels,
+                camera=camera,
+                altitude=0.1,
+                sun=towards,
+                noise=np.hypot(NOISE, MONTE_CARLO),
+                name=f"sun at {zenith}°",
+            )
         )
     start = replace(
         truth,

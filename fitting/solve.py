@@ -385,6 +385,7 @@ def solve(
     progress: Progress | None = None,
     max_steps: int = MAX_STEPS,
     tolerance: float = TOLERANCE,
+    refine: bool = True,
 ) -> Solution:
     """Find the atmosphere that explains ``observations``; see :func:`fitting.fit`, which adds the error bars.
 
@@ -433,7 +434,7 @@ def solve(
         best = search(best.y, best.linearisation, problem, tolerance=tolerance)
     model_error = np.zeros((size, size))
     finer = getattr(model, "finer", None)
-    if best.converged and finer is not None:
+    if refine and best.converged and finer is not None:
         coordinates, radiance = best.y[: parameters.size], best.linearisation.radiance
         correction = _correction(coordinates, problem, radiance, finer())
         problem = eqx.tree_at(lambda p: p.correction, problem, correction)

@@ -234,6 +234,7 @@ def fit(
     progress: Progress | None = None,
     max_steps: int = MAX_STEPS,
     tolerance: float = TOLERANCE,
+    refine: bool = True,
 ) -> FitResult:
     """Recover an atmosphere's parameters from images of its sky, with error bars.
 
@@ -247,6 +248,8 @@ def fit(
         progress: Called after each step.
         max_steps: Evaluations of the model with its derivatives before the fit gives up.
         tolerance: Distance to the optimum, in standard errors, at which it is found.
+        refine: Whether the last steps explain the images by the model's ``finer`` self, if it has one, and the error bars
+            take in what that may leave of the model's error. False fits images that ``model`` itself has made.
 
     Returns:
         The best point found; ``converged`` and ``message`` say whether it is the optimum and why the fit stopped.
@@ -264,5 +267,6 @@ def fit(
         progress=progress,
         max_steps=max_steps,
         tolerance=tolerance,
+        refine=refine,
     )
     return summarise(solution, observations)
