@@ -38,10 +38,6 @@ class Degrees(NamedTuple):
     """Of the higher orders after it."""
 
 
-MAX_DEGREE = 24
-"""More than any degree in use."""
-
-
 class State(NamedTuple):
     """Moments M_lm of the radiance, and the irradiance of the ground by the sky, both divided by ``dusk``."""
 
@@ -187,6 +183,8 @@ class _Transport(eqx.Module):
     of_further: Float[Array, "i k n c w"]
     """The same for further light."""
     survives: Float[Array, "i g w"]
+    known: tuple[int, int] = eqx.field(static=True)
+    """Degrees to which single scattering and further light are known."""
 
     @classmethod
     def build(cls, atmosphere: Atmosphere, shell: Shell, links: Links, first: int, further: int) -> "_Transport":
@@ -203,15 +201,24 @@ class _Transport(eqx.Module):
             source = source_moments(atmosphere, r.nodes.altitude, degree, peak)[..., degrees(degree), :]
             return view * source * links.polar[..., : len(pairs(degree)), None]
 
-        return cls(shell, links, atmosphere.ground_albedo, weight(first, 0.0), weight(further, peak), survives)
+        return cls(
+            shell,
+            links,
+            atmosphere.ground_albedo,
+            weight(first, 0.0),
+            weight(further, peak),
+            survives,
+            (first, further),
+        )
 
     def apply(self, first: State | None, further: State | None, degree: int) -> State:
         """The next order; its moments to ``degree``."""
-        given = [(s, w) for s, w in ((first, self.of_first), (further, self.of_further)) if s is not None]
-        moments = jnp.concatenate([state.moments for state, _ in given], axis=1)
-        weight = jnp.concatenate([weight for _, weight in given], axis=3)
-        m_of = np.concatenate([orders(MAX_DEGREE)[: weight.shape[3]] for _, weight in given])
-        irradiance = sum(state.irradiance for state, _ in given)
+        parts = zip((first, further), (self.of_first, self.of_further), self.known, strict=True)
+        given = [(state, weight, known) for state, weight, known in parts if state is not None]
+        moments = jnp.concatenate([state.moments for state, _, _ in given], axis=1)
+        weight = jnp.concatenate([weight for _, weight, _ in given], axis=3)
+        m_of = np.concatenate([orders(known) for _, _, known in given])
+        irradiance = sum(state.irradiance for state, _, _ in given)
         links, r = self.links, self.links.rays
         # One altitude node after another: the temporary arrays stay in the cache.
         radiance = jax.lax.map(lambda part: gather(moments, part[0], part[1], m_of), (links.ways, weight))
