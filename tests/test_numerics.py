@@ -48,3 +48,21 @@ def test_gauss_legendre_is_exact_to_degree_2n_minus_1():
     for degree in range(8):
         assert w @ x**degree == pytest.approx((3.0 ** (degree + 1) - 1) / (degree + 1), rel=1e-13)
     assert w @ x**8 != pytest.approx((3.0**9 - 1) / 9, rel=1e-7)
+
+
+def test_slopes_shared_by_tangents_are_the_derivatives(x64):
+    """Forward, reverse and batched; by the parameters, by an array, and by neither."""
+
+    def plain(parameters, x):
+        return jnp.exp(-x[None] / parameters[:, None]) * x
+
+    shared = numerics.per_parameter(plain)
+    parameters, x = jnp.array([1.5, 3.0]), jnp.linspace(0.2, 2.0, 5)
+    np.testing.assert_allclose(shared(parameters, x), plain(parameters, x))
+    for number in (0, 1):
+        want = jax.jacfwd(plain, number)(parameters, x)
+        np.testing.assert_allclose(jax.jacfwd(shared, number)(parameters, x), want, rtol=1e-12)
+        np.testing.assert_allclose(jax.jacrev(shared, number)(parameters, x), want, rtol=1e-12)
+    both = lambda f: jax.hessian(lambda p: f(p, x * p[0]).sum())(parameters)
+    np.testing.assert_allclose(both(shared), both(plain), rtol=1e-10)
+    assert float(jnp.abs(jax.grad(lambda c: c * shared(parameters, x).sum())(1.0))) > 0

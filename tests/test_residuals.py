@@ -10,7 +10,7 @@ import toy_sky
 from diffatmo.models import RayMarch
 from fitting.observation import sigma, stack
 from fitting.parameters import select
-from fitting.residuals import Problem, jacobian, linearise, residuals, triangle
+from fitting.residuals import Problem, jacobian, linearise, projected, residuals, smooth_fields, triangle
 
 NM = [680.0, 550.0, 440.0]
 
@@ -91,3 +91,30 @@ def test_triangle_holds_what_least_squares_needs():
     np.testing.assert_allclose(r.T @ r, slope.T @ slope, atol=1e-3)
     np.testing.assert_allclose(r.T @ z, slope.T @ residual, atol=1e-3)
     assert np.sum(factor[:, -1] ** 2) == pytest.approx(np.sum(residual**2), rel=1e-5)
+
+
+def test_smooth_fields_are_orthogonal_with_mean_square_one():
+    """So that a sum of b of them with coefficients of variance 1/b has variance 1 in the mean over the used pixels."""
+    batch = stack(toy_sky.observations(), [680.0, 550.0, 440.0])
+    fields = smooth_fields(batch, 3)
+    used = np.asarray(batch.used)
+    for field, pixels in zip(fields, used, strict=True):
+        assert np.all(field[~pixels] == 0)
+        product = field[pixels].T @ field[pixels] / pixels.sum()
+        np.testing.assert_allclose(product, np.eye(product.shape[0]), atol=1e-8)
+    # On the sphere a polynomial of degree 3 has (3 + 1)² coefficients.
+    assert fields.shape[-1] == 16
+
+
+def test_projection_is_the_jacobian_transposed():
+    """Against a relative error put into the radiance by hand."""
+    ours, y = problem(toy_sky.Toy(), toy_sky.FREE)
+    linearisation = linearise(y[: ours.parameters.size], ours)
+    _, slope = jacobian(y, linearisation, ours)
+    fields = jnp.asarray(smooth_fields(ours.batch, 1), y.dtype)
+    expected = linearisation.radiance * ours.batch.exposure(ours.split(y)[1])
+    got = projected(slope, expected, fields, ours)
+    image, channel, field = 1, 2, 3
+    wrong = expected.at[image, :, channel].multiply(1 + fields[image, :, field])
+    moved = ((wrong - expected) * ours.weight).reshape(-1)
+    np.testing.assert_allclose(got[image, channel, field], slope.T @ moved, rtol=1e-4, atol=1e-2)

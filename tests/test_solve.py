@@ -157,3 +157,59 @@ def test_distance_is_the_fall_of_chi2_of_a_linear_problem():
     # Directions with an error of 1/700 count in full but for its square.
     assert distance(factor) == pytest.approx(np.sqrt(fall), rel=1e-4)
     assert distance(factor, misfit=4.0) == pytest.approx(np.sqrt(fall) / 2, rel=1e-4)
+
+
+class Crude(Toy):
+    """The toy sky with a smooth error of some tenths of a percent, and the toy sky itself as the finer model."""
+
+    def finer(self):
+        return Toy()
+
+    def sky(self, atmosphere):
+        return CrudeSky(atmosphere)
+
+
+class CrudeSky(toy_sky.ToySky):
+    def radiance(self, *, altitude, view, sun):
+        exact = super().radiance(altitude=altitude, view=view, sun=sun)
+        wrong = 1 + 0.004 * view[..., 2:] + 0.003 * view[..., :1] * sun[2] + 0.002 * view[..., 1:2] ** 2
+        return Ray(exact.radiance * wrong, exact.transmittance)
+
+
+def test_the_finer_model_removes_the_error_of_the_coarse_one():
+    """The bias is many standard errors of the noise; what is left of it is none, and the error bars remember it."""
+    images = toy_sky.observations(noise=0.002)
+    settings = {"init": toy_sky.start(), "free": FREE, "model": Crude()}
+    rough = fit(images, refine=False, **settings).with_truth(toy_sky.truth())
+    fine = fit(images, **settings).with_truth(toy_sky.truth())
+    exact = fit(images, init=toy_sky.start(), free=FREE, model=Toy())
+    assert fine.converged
+    assert max(abs(e.pull) for e in rough.parameters) > 10
+    assert max(abs(e.pull) for e in fine.parameters) < 3
+    for ours, best in zip(fine.parameters, exact.parameters, strict=True):
+        assert ours.value == pytest.approx(best.value, abs=0.3 * best.standard_error + 1e-4 * abs(best.value))
+        assert ours.standard_error >= best.standard_error * 0.99
+
+
+def test_model_error_covers_a_third_of_the_correction():
+    """Images with a third of the crude model's error left in them are within the error bars, and not without them."""
+    images = toy_sky.observations(noise=0.001)
+
+    class LessCrude(Toy):
+        def sky(self, atmosphere):
+            return LessCrudeSky(atmosphere)
+
+    class LessCrudeSky(toy_sky.ToySky):
+        def radiance(self, *, altitude, view, sun):
+            exact = super().radiance(altitude=altitude, view=view, sun=sun)
+            wrong = CrudeSky(self.atmosphere).radiance(altitude=altitude, view=view, sun=sun).radiance / exact.radiance
+            return Ray(exact.radiance * (1 + (wrong - 1) / 3), exact.transmittance)
+
+    class Finer(Crude):
+        def finer(self):
+            return LessCrude()
+
+    found = fit(images, init=toy_sky.start(), free=FREE, model=Finer()).with_truth(toy_sky.truth())
+    blind = fit(images, init=toy_sky.start(), free=FREE, model=LessCrude()).with_truth(toy_sky.truth())
+    assert max(abs(e.pull) for e in blind.parameters) > 5
+    assert max(abs(e.pull) for e in found.parameters) < 3
