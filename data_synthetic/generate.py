@@ -25,9 +25,9 @@ HEIGHT, WIDTH = 48, 96
 ALTITUDE_KM = 0.1
 SUN_ZENITH_DEG = (35.0, 65.0, 82.0, 93.0)
 SAMPLES = 4096
-ELECTRONS = 2500.0
-"""At the mean of a picture: photon noise of 2 %."""
-READ = 10.0
+ELECTRONS = 400.0
+"""At the mean of a picture: photon noise of 5 %."""
+READ = 4.0
 """Electrons, standard deviation."""
 FREE = (
     "rayleigh_scattering",

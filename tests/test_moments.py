@@ -155,15 +155,18 @@ def test_no_nan_in_value_at_special_points(s1, sun_zenith_deg):
 
 
 def test_haze_does_not_depend_on_the_resolution(s1):
-    """Aerosol of optical depth 0.05 with a sharp peak: two discretisations with nothing in common but the equations.
+    """Aerosol of optical depth 0.05: two discretisations with nothing in common but the equations.
 
-    Degree 3 against 5 in the iteration: without the delta-M method they differ by 1 %.
+    Degree 3 against 6 in the iteration: without the delta-M method they differ by 1 %. With g = 0.9 what neither resolves is
+    the outskirts of the aureole; there 1 %.
     """
     hazy = eqx.tree_at(
         lambda a: (a.mie_scattering, a.mie_absorption), s1, (10 * s1.mie_scattering, 10 * s1.mie_absorption)
     )
-    view, sun = directions([0.0, 40, 70, 85, 89, 120, 100], [0.0, 120, 60, 170, 90, 30, 150]), directions(75.0, 0.0)
-    default = radiance(Moments(), hazy, jnp.asarray(0.5), view, sun).radiance
-    finer = radiance(Moments().finer(), hazy, jnp.asarray(0.5), view, sun).radiance
-    error = np.asarray(default) / np.asarray(finer) - 1
-    assert np.sqrt(np.mean(error**2)) < 3e-3
+    view = directions([0.0, 40, 70, 85, 89, 120, 100], [0.0, 120, 60, 170, 90, 30, 150])
+    for g, sun_zenith_deg, limit in ((0.8, 75.0, 3e-3), (0.9, 40.0, 1e-2)):
+        air, sun = eqx.tree_at(lambda a: a.mie_g, hazy, jnp.asarray(g)), directions(sun_zenith_deg, 0.0)
+        default = radiance(Moments(), air, jnp.asarray(0.5), view, sun).radiance
+        finer = radiance(Moments().finer(), air, jnp.asarray(0.5), view, sun).radiance
+        error = np.asarray(default) / np.asarray(finer) - 1
+        assert np.sqrt(np.mean(error**2)) < limit

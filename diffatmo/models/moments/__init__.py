@@ -50,32 +50,27 @@ class Moments(Model):
     view_fine_columns: int = 32
 
     def finer(self) -> "Moments":
-        """The same model at a higher resolution: some 0.05 % from Monte Carlo by day, 0.1 % at dusk, ten times the cost."""
+        """The same model at a resolution at which it agrees with Monte Carlo to some 0.03 %, at twenty times the cost."""
 
         def more(count: Directions) -> Directions:
-            degree = count.degree + 2 + count.degree // 5
-            return Directions(
-                sky=3 * count.sky // 2 + 1,
-                ground=3 * count.ground // 2,
-                azimuths=count.azimuths + degree - count.degree,
-                steps=count.steps + 3,
-                degree=degree,
-            )
+            degree = count.degree + 3 + count.degree // 4
+            azimuths = count.azimuths + degree - count.degree
+            return Directions(2 * count.sky, 2 * count.ground, azimuths, count.steps + 5, degree)
 
         return Moments(
-            altitudes=3 * self.altitudes // 2,
-            suns=4 * self.suns // 3,
+            altitudes=7 * self.altitudes // 4,
+            suns=5 * self.suns // 3,
             first=more(self.first),
             iterate=more(self.iterate),
             last=more(self.last),
-            source_degree=2 * self.source_degree,
-            peak_azimuths=self.peak_azimuths,
-            order=self.order,
-            view_steps=self.view_steps + 4,
-            view_sky=4 * self.view_sky // 3,
-            view_ground=self.view_ground + 4,
-            view_columns=self.view_columns + 8,
-            view_fine_columns=3 * self.view_fine_columns // 2,
+            source_degree=5 * self.source_degree // 2,
+            peak_azimuths=2 * self.peak_azimuths,
+            order=self.order + 1,
+            view_steps=self.view_steps + 6,
+            view_sky=2 * self.view_sky,
+            view_ground=2 * self.view_ground,
+            view_columns=2 * self.view_columns,
+            view_fine_columns=2 * self.view_fine_columns,
         )
 
     def shell(self, *, bottom_radius: Scalar, top_altitude: Scalar) -> Shell:

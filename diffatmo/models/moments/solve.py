@@ -156,9 +156,11 @@ def gather(
 
     Sums over l come first, as what depends on azimuth depends on m only; ``m_of`` is the m of every moment.
     """
-    there = jnp.einsum("knh,hcws->kncws", ways.altitude_rows, moments) * weight[..., None]
     degree = m_of.max()
-    by_m = jnp.stack([sum(there[:, :, c] for c in np.flatnonzero(m_of == m)) for m in range(degree + 1)], axis=2)
+    order = np.argsort(m_of, kind="stable")
+    ends = np.cumsum(np.bincount(m_of))
+    there = jnp.einsum("knh,hcws->kncws", ways.altitude_rows, moments[:, order]) * weight[:, :, order, :, None]
+    by_m = jnp.stack([jnp.sum(part, axis=2) for part in jnp.split(there, ends[:-1], axis=2)], axis=2)
     sun_rows = table.cubic_rows(ways.sun_unit, moments.shape[-1], axis=2) * ways.dusk[:, :, None]
     here = jnp.einsum("knmws,kns...->knmw...", by_m, sun_rows)
     around = azimuthal(degree, ways.w, ways.q)
