@@ -41,7 +41,8 @@ FREE = (
 )
 SCALED = ("mie_scattering", "mie_absorption", "ozone_absorption")
 OFF = 1.3
-"""The start is off by this factor, up and down in turn."""
+"""The start is off by this factor: optical depths, products of a coefficient and a height, by its square."""
+TOO_HIGH = ("rayleigh_scattering", "rayleigh_scale_height", "mie_absorption", "ozone_absorption")
 
 ATMOSPHERES = {
     "clear": atmosphere.Atmosphere(
@@ -77,10 +78,8 @@ ATMOSPHERES = {
 
 def start(truth: atmosphere.Atmosphere) -> atmosphere.Atmosphere:
     """A start with every free parameter 30 % off; the asymmetry is moved towards 0.5, which is as wrong and below 1."""
-    values = {}
-    for number, name in enumerate(FREE):
-        value = getattr(truth, name)
-        values[name] = 0.77 * value if name == "mie_g" else value * (OFF if number % 2 else 1 / OFF)
+    values = {name: getattr(truth, name) * (OFF if name in TOO_HIGH else 1 / OFF) for name in FREE}
+    values["mie_g"] = 0.77 * truth.mie_g
     return eqx.tree_at(lambda a: [getattr(a, name) for name in FREE], truth, [values[name] for name in FREE])
 
 

@@ -269,10 +269,10 @@ def loads(text: str, source: str = "atmosphere") -> Atmosphere:
     """Read an atmosphere from TOML text; ``source`` is named in the errors."""
     try:
         return from_dict(tomllib.loads(text))
-    except tomllib.TOMLDecodeError as error:
-        raise AtmosphereError(f"{source}: not a TOML file: {error}") from error
     except AtmosphereError as error:
         raise AtmosphereError(f"{source}: {error}") from error
+    except (ValueError, OverflowError, RecursionError) as error:
+        raise AtmosphereError(f"{source}: not an atmosphere in TOML: {error}") from error
 
 
 def dumps(atmosphere: Atmosphere) -> str:

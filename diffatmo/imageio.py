@@ -64,6 +64,8 @@ def read_image(path: str | Path, *, transfer: str | None = None) -> Image:
         raise ImageError(f"{path}: is a folder, expected an image file") from None
     except OSError as error:
         raise ImageError(f"{path}: cannot be read: {error.strerror}") from None
+    except ValueError as error:
+        raise ImageError(f"{str(path)!r}: not a file name: {error}") from None
     if not data:
         raise ImageError(f"{path}: the file is empty")
     decode = next((reader for magic, reader in _READERS.items() if data.startswith(magic)), None)

@@ -15,8 +15,8 @@ from jaxtyping import Array, Float
 
 
 def tiny(dtype: jnp.dtype) -> float:
-    """The smallest number whose square root and reciprocal are still far from overflow in ``dtype``."""
-    return float(np.sqrt(np.finfo(dtype).tiny))
+    """The smallest number whose square root and reciprocal, and the square of that, do not overflow in ``dtype``."""
+    return 2 * float(np.sqrt(np.finfo(dtype).tiny))
 
 
 def safe_sqrt(x: Float[Array, "..."]) -> Float[Array, "..."]:

@@ -58,9 +58,13 @@ def _shortest(value: Any) -> float:
 def loads(text: str) -> tuple[Scene, dict[str, Any]]:
     """A scene and the notes beside it from TOML text. Raises ``ValueError`` with one line on what is wrong."""
     try:
-        data = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ValueError(f"not TOML: {error}") from error
+        return _scene(tomllib.loads(text))
+    except (TypeError, OverflowError, RecursionError) as error:
+        # Of the wrong type, too large for a number, nested without end: nothing that diffatmo has written.
+        raise ValueError(f"not a scene: {error}") from error
+
+
+def _scene(data: dict[str, Any]) -> tuple[Scene, dict[str, Any]]:
     if data.get("version") != VERSION:
         raise ValueError(f"version: got {data.get('version')!r}, expected {VERSION}")
     missing = [key for key in _KEYS if key not in data]
@@ -79,7 +83,10 @@ def loads(text: str) -> tuple[Scene, dict[str, Any]]:
         sun=jnp.asarray(towards, dtype=jnp.result_type(float)),
         exposure=jnp.asarray(float(data["exposure"])),
     )
-    return scene, dict(data.get("notes", {}))
+    notes = data.get("notes", {})
+    if not isinstance(notes, dict):
+        raise ValueError(f"notes: got {notes!r}, expected a table")
+    return scene, notes
 
 
 _KEYS: dict[str, Any] = {

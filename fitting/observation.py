@@ -194,7 +194,10 @@ class _Refusal(NamedTuple):
 
 
 def _per_pixel(refuse: _Refusal, key: str, value: float | np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    array = np.asarray(value, dtype=np.float32)
+    try:
+        array = np.asarray(value, dtype=np.float32)
+    except (TypeError, ValueError):
+        refuse(f"{key}: got {value!r}, expected one number, or one per channel or pixel of {shape}")
     if array.shape == shape[:2]:
         array = array[..., None]
     try:

@@ -525,7 +525,11 @@ def page(result: FitResult) -> str:
         "<h2>Images</h2>",
         *images,
         "<h2>Fit</h2><div class=pair>",
-        _figure(convergence_figure(result), "Convergence. The second pass takes sigma from the fitted signal."),
+        _figure(
+            convergence_figure(result),
+            "Convergence. Lines part the passes: sigma from the measured signal, from the fitted one, and, where the model "
+            "has one, the finer model. Each changes χ² a little.",
+        ),
         _figure(histogram_figure(result), "Residuals in units of their standard deviation."),
         "</div>",
         _figure(correlation_figure(result), "Correlation of the fitted numbers."),
@@ -541,13 +545,18 @@ def _figure(figure: Figure, caption: str) -> str:
 def _caption(observation: Observation, about: dict[str, Any]) -> str:
     masked = ", ".join(f"{count} {reason}" for reason, count in observation.masked.items())
     median = ", ".join(f"{100 * value:.2g}" for value in about["residuals"]["median_absolute_relative"])
+    of_sigma = ", ".join(f"{value:.2g}" for value in about["residuals"]["rms_sigma"])
     binned = f" (blocks of {observation.block} × {observation.block})" if observation.block > 1 else ""
     return (
         f"{observation.name}: sun at zenith angle {about['sun_zenith_deg']:.1f}°, azimuth "
         f"{about['sun_azimuth_deg']:.1f}°; altitude {observation.altitude:g} km; exposure {observation.exposure}; "
         f"{about['pixels_used']} pixels used{binned}{f', left out: {masked}' if masked else ''}. "
-        f"Median |residual| per wavelength: {median} %."
+        f"Median |residual| per wavelength: {median} %; residual over stated noise, RMS: {of_sigma}."
     )
+
+
+TIED = 0.99999
+"""Correlation of numbers that are multiples of each other."""
 
 
 def _notes(result: FitResult) -> list[str]:
@@ -567,7 +576,8 @@ def _notes(result: FitResult) -> list[str]:
         (matrix[i, j], result.covariance_names[i], result.covariance_names[j])
         for i in range(len(matrix))
         for j in range(i)
-        if matrix[i, j] > 0.95
+        # Numbers that share one factor are one number.
+        if 0.95 < matrix[i, j] < TIED
     ]
     if pairs:
         named = "; ".join(f"{a} and {b} ({r:.3f})" for r, a, b in sorted(pairs, reverse=True)[:6])

@@ -433,14 +433,17 @@ def solve(
         problem = _weigh(problem, _expected(best, problem))
         best = search(best.y, best.linearisation, problem, tolerance=tolerance)
     model_error = np.zeros((size, size))
-    finer = getattr(model, "finer", None)
+    finer = model.finer()
     if refine and best.converged and finer is not None:
         coordinates, radiance = best.y[: parameters.size], best.linearisation.radiance
-        correction = _correction(coordinates, problem, radiance, finer())
-        problem = eqx.tree_at(lambda p: p.correction, problem, correction)
-        start = Linearisation(radiance * correction, best.linearisation.tangents * correction[..., None])
-        best = search(best.y, start, problem, tolerance=tolerance)
-        model_error = _model_error(best, problem)
+        try:
+            correction = jax.block_until_ready(_correction(coordinates, problem, radiance, finer))
+            problem = eqx.tree_at(lambda p: p.correction, problem, correction)
+            start = Linearisation(radiance * correction, best.linearisation.tangents * correction[..., None])
+            best = search(best.y, start, problem, tolerance=tolerance)
+            model_error = _model_error(best, problem)
+        except KeyboardInterrupt:
+            best = best._replace(converged=False, message=INTERRUPTED)
     total = time.perf_counter() - started
     # What a typical evaluation does not explain is compilation and preparation, which happen once.
     evaluations = min(total, len(seconds) * float(np.median(seconds)))

@@ -78,6 +78,9 @@ def files(tmp_path_factory):
     imageio.write_exr(folder / "square.exr", sky(8, 8))
     imageio.write_exr(folder / "other.exr", sky(), wavelengths=[700.0, 500.0, 400.0])
     imageio.write_exr(folder / "damaged.exr", sky(), {scene.ATTRIBUTE: "version = 1\n"})
+    imageio.write_exr(
+        folder / "notes.exr", sky(), {scene.ATTRIBUTE: "notes = 3\n" + scene.dumps(seen).replace("[notes]", "")}
+    )
     imageio.write_exr(folder / "flat.exr", np.full((16, 32, 3), 0.1, np.float32))
     imageio.write_png(folder / "eight_bits.png", sky())
     Image.fromarray((255 * sky()).astype(np.uint8)).save(folder / "photo.jpg")
@@ -97,6 +100,10 @@ def files(tmp_path_factory):
         "sun_word.scene": '[[image]]\nfile = "good.exr"\nsun = "find"\n',
         "noise.scene": '[[image]]\nfile = "good.exr"\nnoise = "low"\n',
         "toml.scene": "init = \n",
+        "nul.scene": '[[image]]\nfile = "a\\u0000b"\n',
+        "large.scene": f'[[image]]\nfile = "good.exr"\nnoise = {"9" * 400}\n',
+        "larger.scene": f'[[image]]\nfile = "good.exr"\nnoise = {"9" * 5000}\n',
+        "deep.scene": f"free = {'[' * 5000}\n",
     }
     for name, content in scenes.items():
         (folder / name).write_text(content)
@@ -166,6 +173,11 @@ CASES = {
     "all NaN": (["fit", "NAN.exr"], "NAN.exr"),
     "all black": (["fit", "BLACK.exr"], "black"),
     "damaged header": (["fit", "DAMAGED.exr"], "header"),
+    "header with a wrong type": (["fit", "NOTES.exr"], "notes"),
+    "NUL in a name": (["fit", "--config", "NUL.scene"], "file name"),
+    "number too large": (["fit", "--config", "LARGE.scene"], "too large"),
+    "number without end": (["fit", "--config", "LARGER.scene"], "TOML"),
+    "nested without end": (["fit", "--config", "DEEP.scene"], "TOML"),
     "no header": (["fit", "BARE.exr"], "projection"),
     "no header, no altitude": (["fit", "BARE.exr", "--projection", "equirectangular"], "altitude_km"),
     "no header, no sun": (["fit", "BARE.exr", *PANORAMA[:4]], "sun_zenith_deg"),

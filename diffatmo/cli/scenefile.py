@@ -82,10 +82,12 @@ def read_scene(path: Path) -> FitSpec:
     """Read a scene file; relative paths in it are relative to it."""
     try:
         data = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: not a TOML file: {error}") from error
     try:
         return _scene(data, path.parent)
+    except OverflowError as error:
+        raise InputError(f"{path}: a number is too large: {error}") from error
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
 

@@ -69,6 +69,7 @@ class Sky(eqx.Module):
 
         The ground is included where the ray meets it, the sun's disc is not. The frame is local: x east, y north, z up.
         """
+        view = jnp.asarray(view, jnp.result_type(view, 1.0))
         altitude = jnp.asarray(altitude, dtype=view.dtype)
         mu, mu_s, nu = view[..., 2], sun[..., 2], jnp.sum(view * sun, axis=-1)
         altitude, mu, mu_s, nu = jnp.broadcast_arrays(altitude, mu, mu_s, nu)
@@ -102,3 +103,7 @@ class Model(eqx.Module):
     @abstractmethod
     def sky(self, atmosphere: Atmosphere) -> Sky:
         """The sky of ``atmosphere``."""
+
+    def finer(self) -> "Model | None":
+        """The same model at a higher resolution, by which a fit judges and corrects its own; None if there is none."""
+        return None

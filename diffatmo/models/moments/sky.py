@@ -121,6 +121,7 @@ class MomentsSky(Sky):
 
     def view(self, *, altitude: Altitude, sun: Direction) -> "MomentsView":
         """Tabulate everything that is smooth in direction for one altitude and one sun."""
+        sun = jnp.asarray(sun, jnp.result_type(sun, 1.0))
         return MomentsView.build(self, jnp.asarray(altitude, sun.dtype), sun)
 
 

@@ -18,7 +18,7 @@ from diffatmo._types import Altitude, Scalar
 from diffatmo.atmosphere import Atmosphere
 from diffatmo.models.moments.angular import azimuthal, cosines, degrees, orders, pairs, relative_nu
 from diffatmo.models.moments.shell import Links, Rays, Shell, Ways
-from diffatmo.numerics import per_parameter, safe_divide
+from diffatmo.numerics import per_parameter, tiny
 from diffatmo.rays import PIECES, Nodes
 
 CHUNK = 2
@@ -47,7 +47,9 @@ class State(NamedTuple):
 
 def _tail(last: Float[Array, "..."], previous: Float[Array, "..."]) -> Float[Array, "..."]:
     """Σ_{n>=1} (last / previous)^n, for the orders beyond the last one computed."""
-    ratio = jnp.clip(safe_divide(last, previous), 0, 0.95)
+    # Squared by the derivative, what is smaller would overflow; such light is of no account.
+    counts = previous > tiny(previous.dtype)
+    ratio = jnp.clip(jnp.where(counts, last, 0) / jnp.where(counts, previous, 1), 0, 0.95)
     return ratio / (1 - ratio)
 
 
@@ -193,7 +195,9 @@ class _Transport(eqx.Module):
         """Prepare for single scattering known to degree ``first`` and all other light to degree ``further``."""
         r = links.rays
         start = jnp.broadcast_to(shell.altitude[:, None], r.mu.shape)
-        peak = phase.mie_moments(atmosphere.mie_g, further + 1, atmosphere.mie_phase)[-1]
+        # No forward peak where scattering is backward.
+        forward = jnp.maximum(atmosphere.mie_g, 0)
+        peak = phase.mie_moments(forward, further + 1, atmosphere.mie_phase)[-1]
         thin = eqx.tree_at(lambda a: a.mie_scattering, atmosphere, (1 - peak) * atmosphere.mie_scattering)
         along, end = transmittance.columns_along(atmosphere, start, r.mu, r.nodes, r.steps)
         view = (jnp.exp(-transmittance.optical_depth(thin, along)) * r.nodes.weight[..., None])[..., None, :]
