@@ -58,9 +58,11 @@ def joint_fit(model, air):
         towards = sun.direction(zenith=np.radians(zenith), azimuth=0.0)
         radiance = np.asarray(render.render(diffatmo.Scene(air, camera, 0.1, towards), model.finer()))
         noisy = radiance * (1 + NOISE * rng.standard_normal(radiance.shape))
-        observations.append(fitting.observe(noisy, camera=camera, altitude=0.1, sun=towards, noise=NOISE))
-    start = replace(air, **{name: (0.77 if n % 2 else 1.3) * getattr(air, name) for n, name in enumerate(ELEVEN)})
-    start = replace(start, mie_g=0.6)
+        observations.append(
+            fitting.observe(noisy, camera=camera, altitude=0.1, sun=towards, noise=NOISE, name=f"{zenith:g}°")
+        )
+    off = {name: (0.77 if n % 3 else 1.3) * getattr(air, name) for n, name in enumerate(ELEVEN)}
+    start = replace(air, **(off | {"mie_g": 0.6}))
     seconds = []
     for _ in range(2):
         before = time.perf_counter()
