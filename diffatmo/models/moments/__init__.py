@@ -33,7 +33,11 @@ __all__ = ["Moments", "MomentsSky", "MomentsView", "Shell"]
 
 
 class Moments(Model):
-    """The default model. Fields are resolutions; the defaults keep the sky within about 0.1 % of Monte Carlo."""
+    """The default model. Fields are resolutions.
+
+    The defaults keep the RMS over the sky within 0.1 to 0.2 % of Monte Carlo by day and at dusk, 0.4 % with a low sun in haze
+    of optical depth 0.3.
+    """
 
     altitudes: int = 16
     suns: int = 24
