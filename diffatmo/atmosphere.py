@@ -272,7 +272,7 @@ def loads(text: str, source: str = "atmosphere") -> Atmosphere:
     except AtmosphereError as error:
         raise AtmosphereError(f"{source}: {error}") from error
     except (ValueError, OverflowError, RecursionError) as error:
-        raise AtmosphereError(f"{source}: not an atmosphere in TOML: {error}") from error
+        raise AtmosphereError(f"{source}: not a TOML file of an atmosphere: {error}") from error
 
 
 def dumps(atmosphere: Atmosphere) -> str:

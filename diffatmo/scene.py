@@ -58,7 +58,11 @@ def _shortest(value: Any) -> float:
 def loads(text: str) -> tuple[Scene, dict[str, Any]]:
     """A scene and the notes beside it from TOML text. Raises ``ValueError`` with one line on what is wrong."""
     try:
-        return _scene(tomllib.loads(text))
+        data = tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"not TOML: {error}") from error
+    try:
+        return _scene(data)
     except (TypeError, OverflowError, RecursionError) as error:
         # Of the wrong type, too large for a number, nested without end: nothing that diffatmo has written.
         raise ValueError(f"not a scene: {error}") from error
