@@ -73,8 +73,10 @@ LARGEST_CORRECTION = 1.25
 """Factor beyond which a finer model is no correction any more."""
 
 REMAINING = 1 / 5
-"""Error of a finer model over the difference to the coarser one: about that much for ``Moments`` against Monte Carlo, in
-atmospheres of aerosol optical depth 0.005 to 0.3 under suns from 35° to 95° (``tests/benchmarks/accuracy.py``)."""
+"""Error of a finer model over the difference to the coarser one: at most that for ``Moments`` against Monte Carlo in
+atmospheres of aerosol optical depth 0.1 to 0.3 and g up to 0.74, suns from 35° to 93°, once the Monte Carlo's own error is
+taken off (``tests/benchmarks/accuracy.py``). Not so for g = 0.9, where neither resolves the outskirts of the aureole and the
+model's error is understated."""
 
 FIELD_DEGREE = 3
 """Degree in direction up to which the model's errors are correlated."""
