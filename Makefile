@@ -2,6 +2,8 @@
 PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
+# Most of the time of the suite goes to the compiler; see diffatmo/compiling.py.
+COMPILE_FAST := --xla_cpu_use_fusion_emitters=false
 
 .PHONY: demo test clean
 
@@ -12,7 +14,7 @@ test: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/pytest -n 2
+	XLA_FLAGS=$(COMPILE_FAST) $(BIN)/pytest -n 2 --dist loadfile
 
 $(READY): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "diffatmo needs Python 3.11 or newer; say which with: make PYTHON=/path/to/python3")'

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     )
     from diffatmo.atmosphere import Atmosphere, AtmosphereError, earth, load, mars, save
     from diffatmo.camera import Camera, Equirectangular, Fisheye, Pinhole
+    from diffatmo.compiling import compiler_options
     from diffatmo.imageio import ImageError
     from diffatmo.models import Model, Moments, PathTrace, RayMarch, Sky, View
     from diffatmo.render import Scene
@@ -47,6 +48,7 @@ _HOME = {
     "Scene": "render",
     "Sky": "models",
     "View": "models",
+    "compiler_options": "compiling",
     "earth": "atmosphere",
     "load": "atmosphere",
     "mars": "atmosphere",
@@ -73,6 +75,7 @@ __all__ = [
     "atmosphere",
     "camera",
     "color",
+    "compiler_options",
     "constants",
     "earth",
     "geometry",

@@ -168,13 +168,14 @@ class Parameters(eqx.Module):
         """Coordinates of ``init``."""
         return jnp.concatenate([block.start for block in self.blocks])
 
-    def _split(self, y: Coordinates) -> list[Coordinates]:
-        ends = np.cumsum([block.start.size for block in self.blocks])
-        return jnp.split(y, ends[:-1])
+    @property
+    def _cuts(self) -> Int[np.ndarray, " b"]:
+        """Where the coordinates of one block end and those of the next begin."""
+        return np.cumsum([block.start.size for block in self.blocks])[:-1]
 
     def atmosphere(self, y: Coordinates) -> Atmosphere:
         """The atmosphere at coordinates ``y``."""
-        values = [block.value(part) for block, part in zip(self.blocks, self._split(y), strict=True)]
+        values = [block.value(part) for block, part in zip(self.blocks, jnp.split(y, self._cuts), strict=True)]
         return eqx.tree_at(lambda a: [getattr(a, block.field) for block in self.blocks], self.init, values)
 
     @property
@@ -183,12 +184,13 @@ class Parameters(eqx.Module):
         lower, upper = zip(*(block.bijection.limits for block in self.blocks), strict=True)
         return jnp.concatenate(lower), jnp.concatenate(upper)
 
-    def at_bound(self, y: Coordinates) -> Bool[np.ndarray, " q"]:
+    def at_bound(self, y: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " q"]:
         """Whether each number of the free fields is at its bound, in the order of :func:`quantities`."""
         result = []
-        for block, part in zip(self.blocks, self._split(y), strict=True):
-            lower, upper = block.bijection.limits
-            result.append(np.broadcast_to((part <= lower) | (part >= upper), jnp.size(getattr(self.init, block.field))))
+        for block, part in zip(self.blocks, np.split(y, self._cuts), strict=True):
+            lower, upper = (np.asarray(limit) for limit in block.bijection.limits)
+            outside = (part <= lower) | (part >= upper)
+            result.append(np.broadcast_to(outside, jnp.size(getattr(self.init, block.field))))
         return np.concatenate(result)
 
     def colours(self) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"]]:

@@ -63,7 +63,6 @@ class Problem(eqx.Module):
         return jnp.concatenate([lower, -endless]), jnp.concatenate([upper, endless])
 
 
-@eqx.filter_jit
 def planet_shell(model: Model, parameters: Parameters) -> Any:
     """The geometry that ``model`` would else compute in each step; None if there is none or the planet is free."""
     if not isinstance(model, Moments) or {"bottom_radius", "top_radius"} & {b.field for b in parameters.blocks}:

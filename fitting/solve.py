@@ -22,6 +22,7 @@ from the fitted one.
 import math
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -33,6 +34,7 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from diffatmo.atmosphere import Atmosphere
+from diffatmo.compiling import compile_ahead, outermost
 from diffatmo.models.base import Model
 from fitting._errors import FitError
 from fitting.observation import Batch, Observation, exposures, sigma, stack
@@ -148,10 +150,6 @@ class Solution(NamedTuple):
         return self.residual_count - self.y.size
 
 
-_linearise = eqx.filter_jit(linearise)
-
-
-@eqx.filter_jit
 def _correction(coordinates: Coordinates, problem: Problem, radiance: Predicted, finer: Model) -> Predicted:
     """What ``finer`` expects over the ``radiance`` of the problem's own model; 1 where there is nothing to compare."""
     wanted = predict(finer.sky(problem.parameters.atmosphere(coordinates)), problem.batch)
@@ -160,7 +158,6 @@ def _correction(coordinates: Coordinates, problem: Problem, radiance: Predicted,
     return jnp.where(known, jnp.clip(ratio, 1 / LARGEST_CORRECTION, LARGEST_CORRECTION), 1)
 
 
-@eqx.filter_jit
 def _projected(
     y: Coordinates, linearisation: Linearisation, fields: Float[Array, "image pixel b"], problem: Problem
 ) -> Float[Array, "image w b n"]:
@@ -182,7 +179,7 @@ def _model_error(best: "_Point", problem: Problem) -> Float[np.ndarray, "n n"]:
     amplitude = REMAINING * np.sqrt((deviation**2).sum(axis=1) / count)
     fields = smooth_fields(problem.batch, FIELD_DEGREE)
     pushes = np.asarray(
-        _projected(best.y, best.linearisation, jnp.asarray(fields, best.y.dtype), problem), dtype=np.float64
+        outermost(_projected)(best.y, best.linearisation, jnp.asarray(fields, best.y.dtype), problem), dtype=np.float64
     )
     pushes *= amplitude[:, :, None, None] / math.sqrt(2 * fields.shape[-1])
     pushes = np.concatenate([pushes.reshape(-1, best.y.size), pushes.sum(axis=1).reshape(-1, best.y.size)])
@@ -194,7 +191,6 @@ def _model_error(best: "_Point", problem: Problem) -> Float[np.ndarray, "n n"]:
     return shifts.T @ shifts
 
 
-@eqx.filter_jit
 def _reduce(y: Coordinates, linearisation: Linearisation, problem: Problem) -> Float[Array, "n+1 n+1"]:
     return triangle(*jacobian(y, linearisation, problem))
 
@@ -205,7 +201,6 @@ def _tangent_plane(y: Coordinates, plane: tuple[Array, Array, Array]) -> tuple[A
     return residual + jnp.sum(jacobian * (y - origin), axis=-1), None
 
 
-@eqx.filter_jit
 def _start(y: Coordinates) -> Any:
     n = y.size
     plane = (jnp.zeros(n + 1, y.dtype), jnp.zeros((n + 1, n), y.dtype), y)
@@ -213,7 +208,6 @@ def _start(y: Coordinates) -> Any:
     return _SOLVER.init(_tangent_plane, y, plane, {}, residual, None, frozenset())
 
 
-@eqx.filter_jit
 def _step(y: Coordinates, state: Any, plane: tuple[Array, Array, Array]) -> tuple[Coordinates, Any]:
     y, state, _ = _SOLVER.step(_tangent_plane, y, plane, {}, state, frozenset())
     return y, state
@@ -270,8 +264,8 @@ def _minimise(
     progress: Progress | None,
 ) -> _Point:
     """Levenberg-Marquardt from ``y``, where the model is linearised already, until ``history`` holds ``max_steps``."""
-    state = _start(y)
-    limits = (np.asarray(problem.limits[0]), np.asarray(problem.limits[1]))
+    state = outermost(_start)(y)
+    limits = jax.tree.map(np.asarray, problem.limits)
     freedom = max(_count(problem.batch) - y.size, 1)
     stage = history[-1].stage + 1 if history else 1
     best: _Point | None = None
@@ -279,9 +273,9 @@ def _minimise(
     try:
         while best is None or len(history) < max_steps:
             started = time.perf_counter()
-            trial = _shorten(y, state.y_eval, limits)
+            trial = outermost(_shorten)(y, state.y_eval, limits)
             linearisation = start if best is None else evaluate(trial, problem)
-            factor = np.asarray(_reduce(trial, linearisation, problem), dtype=np.float64)
+            factor = np.asarray(outermost(_reduce)(trial, linearisation, problem), dtype=np.float64)
             finite = bool(np.all(np.isfinite(factor)))
             if finite:
                 chi2, held = float(np.sum(factor[:, -1] ** 2)), _hold(factor, np.asarray(trial), limits)
@@ -297,10 +291,10 @@ def _minimise(
                 previous, misfit = misfit, max(1.0, chi2 / freedom)
                 step_size = step_size * (previous / misfit)
             state = eqx.tree_at(lambda s: (s.y_eval, s.search_state.step_size), state, (trial, step_size))
-            change = float(jnp.max(jnp.abs(trial - y)))
+            change = float(np.max(np.abs(np.asarray(trial) - np.asarray(y))))
             plane = jnp.asarray(held / math.sqrt(scale), dtype=y.dtype)
-            y, state = _step(y, state, (plane[:, -1], plane[:, :-1], trial))
-            accepted = best is None or (finite and bool(jnp.all(y == trial)))
+            y, state = outermost(_step)(y, state, (plane[:, -1], plane[:, :-1], trial))
+            accepted = best is None or (finite and np.array_equal(y, trial))
             if best is None or accepted:
                 best = _Point(y, linearisation, factor, chi2, distance(held, misfit))
             rejections = 0 if accepted else rejections + 1
@@ -319,7 +313,7 @@ def _minimise(
             )
             if progress is not None:
                 progress(history[-1])
-            if bool(jnp.all(_shorten(y, state.y_eval, limits) == y)):
+            if np.array_equal(outermost(_shorten)(y, state.y_eval, limits), y):
                 rejections = REJECTIONS_AT_MOST
             end = _end(best.distance, rejections, tolerance)
             if end is not None:
@@ -344,7 +338,7 @@ def _end(away: float, rejections: int, tolerance: float) -> tuple[bool, str] | N
 
 def _count(batch: Batch) -> int:
     """Number of residuals."""
-    return int(jnp.sum(batch.used)) * batch.measured.shape[-1]
+    return int(np.sum(np.asarray(batch.used))) * batch.measured.shape[-1]
 
 
 def _check_finite(start: Linearisation, batch: Batch, names: Sequence[str]) -> None:
@@ -360,11 +354,11 @@ def _check_finite(start: Linearisation, batch: Batch, names: Sequence[str]) -> N
 def _weigh(problem: Problem, expected: Array) -> Problem:
     """``problem`` with the weights of pixels whose expected signal is ``expected``."""
     weight = jnp.where(problem.batch.used[..., None], 1 / sigma(problem.batch, expected), 0)
-    return eqx.tree_at(lambda p: p.weight, problem, weight)
+    return replace(problem, weight=weight)
 
 
-def _expected(point: _Point, problem: Problem) -> Predicted:
-    return point.linearisation.radiance * problem.batch.exposure(problem.split(point.y)[1])
+def _expected(y: Coordinates, linearisation: Linearisation, problem: Problem) -> Predicted:
+    return linearisation.radiance * problem.batch.exposure(problem.split(y)[1])
 
 
 def _starting_exposures(radiance: np.ndarray, batch: Batch) -> Float[np.ndarray, " e"]:
@@ -408,15 +402,21 @@ def solve(
         raise FitError(
             f"{_count(batch)} pixels and channels cannot determine {size} parameters; mask less or free less"
         )
-    shell = planet_shell(model, parameters)
-    no_correction = jnp.ones_like(batch.measured)
-    problem = Problem(model, parameters, batch, jnp.zeros_like(batch.measured), shell, no_correction)
-    problem = _weigh(problem, batch.measured)
+    # Three programs, the longest first, compiled at the same time.
+    signal, of_planet = batch.measured, eqx.filter_eval_shape(planet_shell, model, parameters)
+    problem = Problem(model, parameters, batch, signal, of_planet, jnp.ones_like(signal))
+    compiling = [compile_ahead(linearise, parameters.start, problem)]
+    finer = model.finer() if refine else None
+    if finer is not None:
+        compiling.append(compile_ahead(_correction, parameters.start, problem, signal, finer))
+    problem = replace(problem, shell=outermost(planet_shell)(model, parameters))
+    problem = outermost(_weigh)(problem, signal)
+    compiling[0].join()
     seconds: list[float] = []
 
     def evaluate(y: Coordinates, problem: Problem) -> Linearisation:
         before = time.perf_counter()
-        result = jax.block_until_ready(_linearise(y[: parameters.size], problem))
+        result = jax.block_until_ready(outermost(linearise)(y[: parameters.size], problem))
         seconds.append(time.perf_counter() - before)
         return result
 
@@ -432,15 +432,15 @@ def solve(
         tolerance=max(tolerance, FIRST_PASS_TOLERANCE),
     )
     if best.message != INTERRUPTED:
-        problem = _weigh(problem, _expected(best, problem))
+        problem = outermost(_weigh)(problem, outermost(_expected)(best.y, best.linearisation, problem))
         best = search(best.y, best.linearisation, problem, tolerance=tolerance)
     model_error = np.zeros((size, size))
-    finer = model.finer()
-    if refine and best.converged and finer is not None:
+    if finer is not None and best.converged:
         coordinates, radiance = best.y[: parameters.size], best.linearisation.radiance
         try:
-            correction = jax.block_until_ready(_correction(coordinates, problem, radiance, finer))
-            problem = eqx.tree_at(lambda p: p.correction, problem, correction)
+            compiling[-1].join()
+            correction = jax.block_until_ready(outermost(_correction)(coordinates, problem, radiance, finer))
+            problem = replace(problem, correction=correction)
             start = Linearisation(radiance * correction, best.linearisation.tangents * correction[..., None])
             best = search(best.y, start, problem, tolerance=tolerance)
             model_error = _model_error(best, problem)
@@ -455,7 +455,7 @@ def solve(
         exposure_names=names,
         y=best.y,
         triangle=best.triangle,
-        predicted=np.asarray(_expected(best, problem)),
+        predicted=np.asarray(outermost(_expected)(best.y, best.linearisation, problem)),
         model_error=model_error,
         history=history,
         residual_count=_count(batch),

@@ -172,18 +172,20 @@ def summarise(solution: Solution, observations: Sequence[Observation]) -> FitRes
     fitted_quantities = quantities(free, wavelengths)
     all_quantities = fitted_quantities + quantities(derived, wavelengths)
 
-    def physical(y: Coordinates) -> Float[Array, " q"]:
-        return jnp.concatenate([numbers(parameters.atmosphere(y[:count]), free + derived), jnp.exp(y[count:])])
+    def physical(y: Coordinates) -> tuple[Float[Array, " q"], tuple[Float[Array, " q"], Atmosphere]]:
+        atmosphere = parameters.atmosphere(y[:count])
+        values = jnp.concatenate([numbers(atmosphere, free + derived), jnp.exp(y[count:])])
+        return values, (values, atmosphere)
 
-    values = np.asarray(physical(solution.y), dtype=float)
-    gradient = np.asarray(jax.jacfwd(physical)(solution.y), dtype=float)
+    slopes, (numbers_found, atmosphere) = jax.jit(jax.jacfwd(physical, has_aux=True))(solution.y)
+    values, gradient = np.asarray(numbers_found, dtype=float), np.asarray(slopes, dtype=float)
     covariance, determined = propagate(solution.triangle[:-1, :-1], gradient)
     reduced_chi2 = solution.chi2 / max(solution.degrees_of_freedom, 1)
     scale = max(1.0, math.sqrt(reduced_chi2))
     covariance = scale**2 * covariance + gradient @ solution.model_error @ gradient.T
     errors = [math.sqrt(v) if ok else None for v, ok in zip(np.diag(covariance), determined, strict=True)]
     initial = np.asarray(numbers(parameters.init, free + derived), dtype=float)
-    at_bound = parameters.at_bound(solution.y[:count])
+    at_bound = parameters.at_bound(np.asarray(solution.y)[:count])
 
     estimates = [
         Estimate(
@@ -205,7 +207,7 @@ def summarise(solution: Solution, observations: Sequence[Observation]) -> FitRes
     ]
     reported = [*range(len(fitted_quantities)), *range(len(all_quantities), len(values))]
     return FitResult(
-        atmosphere=parameters.atmosphere(solution.y[:count]),
+        atmosphere=atmosphere,
         parameters=estimates,
         exposures=factors,
         covariance=covariance[np.ix_(reported, reported)],

@@ -17,7 +17,7 @@ ROOT = Path(__file__).parent.parent
 # One row per level; a module may import from any earlier row, never from its own. A package's own name means its
 # __init__.py.
 LEVELS = [
-    ["diffatmo._types", "diffatmo.constants"],
+    ["diffatmo._types", "diffatmo.constants", "diffatmo.compiling"],
     ["diffatmo.numerics"],
     [f"diffatmo.{name}" for name in ("geometry", "phase", "table", "spectrum", "color", "codecs", "camera", "sun")],
     ["diffatmo.rays", "diffatmo.atmosphere"],

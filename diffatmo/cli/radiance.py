@@ -118,10 +118,11 @@ def _numbers(where: str, header: list[str], row: list[str]) -> list[float]:
 
 def compute(atmosphere: "Atmosphere", table: Table, model: "Model") -> list[list[str]]:
     """What to add to each row, with the digits that its precision has."""
-    import equinox as eqx
     import jax
     import jax.numpy as jnp
     import numpy as np
+
+    from diffatmo.compiling import outermost
 
     altitude, sun_zenith, view_zenith, view_azimuth = np.asarray(table.numbers).T
     degrees = np.radians(np.stack([sun_zenith, view_zenith, view_azimuth]))
@@ -132,8 +133,8 @@ def compute(atmosphere: "Atmosphere", table: Table, model: "Model") -> list[list
     count = len(table.rows)
     chunks = -(-count // CHUNK)
     size = -(-count // chunks)
-    sky = eqx.filter_jit(model.sky)(atmosphere)
-    ask = eqx.filter_jit(_ask)
+    sky = outermost(type(model).sky)(model, atmosphere)
+    ask = outermost(_ask)
     parts = []
     for number in range(chunks):
         rows = np.minimum(np.arange(number * size, (number + 1) * size), count - 1)

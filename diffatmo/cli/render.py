@@ -77,6 +77,7 @@ def render(
     import numpy as np
 
     from diffatmo import render, sun
+    from diffatmo.compiling import outermost
 
     chosen = make_model(model, samples=samples, seed=seed)
     air = read_atmosphere(atmosphere)
@@ -91,7 +92,7 @@ def render(
         ),
         exposure=options.get("exposure", 1.0),
     )
-    pixels = np.asarray(render.render(scene, chosen, sun_disc=sun_disc))
+    pixels = np.asarray(outermost(render.render)(scene, chosen, sun_disc=sun_disc))
     for path, write in writers:
         write(path, pixels, scene, {"model": model, "sun_disc": sun_disc}, "exposure" not in given)
 

@@ -80,14 +80,18 @@ def main() -> None:
         changed = eqx.tree_at(lambda a: tuple(getattr(a, name) for name in NINE), air, fields)
         return model.sky(changed).view(altitude=0.1, sun=towards).radiance(view=view).radiance
 
+    quickly = {"compiler_options": diffatmo.compiler_options()}
     upper = diffatmo.Equirectangular(64, 128, upper=True).directions()
     full = diffatmo.Equirectangular(128, 256).directions()
     x = jnp.zeros(len(NINE))
     table = Table("what", "first call, s", "median, ms", "least, ms", title=f"{processor()}, jax {jax.__version__}")
     for what, function, arguments in (
         ("parameters → 128×64 upper sky", jax.jit(image), (x, upper)),
+        ("the same, compiler_options()", jax.jit(image, **quickly), (x, upper)),
         ("parameters → 256×128 full sphere", jax.jit(image), (x, full)),
+        ("the same, compiler_options()", jax.jit(image, **quickly), (x, full)),
         ("Jacobian of 128×64 in 9 parameters (5 tangents)", jax.jit(jax.jacfwd(image)), (x, upper)),
+        ("the same, compiler_options()", jax.jit(jax.jacfwd(image), **quickly), (x, upper)),
     ):
         first, median, least = timed(function, *arguments)
         table.add_row(what, f"{first:.1f}", f"{1e3 * median:.0f}", f"{1e3 * least:.0f}")
