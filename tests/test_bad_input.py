@@ -160,6 +160,10 @@ CASES = {
         ["render", "GOOD.toml", "-o", "new.exr", "--projection", "pinhole", "--fov-deg", "180"],
         "fov_deg",
     ),
+    "field of view of nothing": (
+        ["fit", "GOOD.exr", "--projection", "fisheye", "--fov-deg", "1e-30"],
+        "--fov-deg: got 1e-30, expected a number from 0.01 to 360",
+    ),
     "no pixels": (["render", "GOOD.toml", "-o", "new.exr", "--width", "0"], "--width"),
     "altitude below ground": (["render", "GOOD.toml", "-o", "new.exr", "--altitude-km", "-1"], "--altitude-km"),
     "sun not a number": (["render", "GOOD.toml", "-o", "new.exr", "--sun-zenith-deg", "nan"], "--sun-zenith-deg"),

@@ -30,7 +30,7 @@ PLAIN_WIDTH = 120
 @click.option(
     "--init", metavar="ATM.toml", help="Where the fit starts: an atmosphere file or a preset.  [default: earth]"
 )
-@click.option("--free", metavar="NAME,...", help=f"Parameters to recover.  [default: {','.join(FREE)}]")
+@click.option("--free", metavar="NAME,...", help=f"Parameters to recover.  [default: {', '.join(FREE)}]")
 @click.option("--scaled", metavar="NAME,...", help="Those of them that keep the ratios they start with.")
 @click.option("--model", type=click.Choice(MODELS), help="How the sky is computed.  [default: moments]")
 @click.option("--max-steps", type=click.IntRange(min=1), help="Steps before the fit gives up.  [default: 100]")

@@ -28,14 +28,18 @@ IMAGE_KEYS: dict[str, Key] = {
     **PLACE_KEYS,
     "sun_zenith_deg": Number("Zenith angle of the sun; above 90 it is below the horizon.", 0, 108),
     "sun": Word("Find the sun in the picture.", ("detect",)),
-    "exposure": Word("fixed, free, free-per-channel, or the name of a group of images that share one."),
-    "noise": Number("Relative standard deviation per pixel and channel.", 0, 10),
-    "noise_shot": Number("Variance per unit of signal (photon noise).", 0),
-    "noise_floor": Number("Standard deviation of a dark pixel (read noise).", 0),
+    "exposure": Word(
+        "fixed, free, free-per-channel, or the name of a group of images that share one.  [default: fixed]"
+    ),
+    "noise": Number("Relative standard deviation per pixel and channel.  [default: 0.01]", 0, 10),
+    "noise_shot": Number("Variance per unit of signal (photon noise).  [default: 0]", 0, 1e30),
+    "noise_floor": Number("Standard deviation of a dark pixel (read noise).  [default: 1e-4 of the median]", 0, 1e30),
     "saturation": Number("Leave out pixels with a channel at or above this value.", 0, positive=True),
-    "view_zenith_max_deg": Number("Use pixels up to this zenith angle: 90 the sky, 180 the ground too.", 0, 180, True),
-    "sun_exclusion_deg": Number("Leave out pixels nearer to the sun.", 0, 179),
-    "horizon_exclusion_deg": Number("Leave out pixels nearer to the horizon.", 0, 89),
+    "view_zenith_max_deg": Number(
+        "Use pixels up to this zenith angle: 90 the sky, 180 the ground too.  [default: 90]", 0, 180, True
+    ),
+    "sun_exclusion_deg": Number("Leave out pixels nearer to the sun.  [default: 2]", 0, 179),
+    "horizon_exclusion_deg": Number("Leave out pixels nearer to the horizon.  [default: 0]", 0, 89),
     "mask": Word("A picture that is black where pixels are to be left out."),
     "transfer": Word("Transfer function of an 8-bit picture.", ("srgb", "linear")),
 }

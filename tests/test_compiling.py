@@ -1,0 +1,39 @@
+"""Options of the compiler change how long it takes, never what comes out."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import diffatmo
+from diffatmo.compiling import compile_ahead, outermost
+
+
+def shift(x, by):
+    return jnp.sin(x) + by
+
+
+def test_options_are_ones_that_this_compiler_knows():
+    options = diffatmo.compiler_options()
+    assert options or jax.default_backend() != "cpu"
+    x = jnp.linspace(0, 1, 5)
+    np.testing.assert_allclose(jax.jit(shift, compiler_options=options)(x, 1.0), shift(x, 1.0), rtol=1e-6)
+
+
+def test_options_of_another_compiler_are_left_out(monkeypatch):
+    monkeypatch.setattr("diffatmo.compiling._CPU", {"xla_cpu_no_such_option": True})
+    diffatmo.compiler_options.cache_clear()
+    assert diffatmo.compiler_options() == {}
+    diffatmo.compiler_options.cache_clear()
+
+
+def test_what_is_compiled_ahead_is_not_compiled_again():
+    traces = []
+
+    def counted(x, by):
+        traces.append(1)
+        return shift(x, by)
+
+    x = jnp.linspace(0, 1, 7)
+    compile_ahead(counted, jax.ShapeDtypeStruct(x.shape, x.dtype), by=x).join()
+    np.testing.assert_allclose(outermost(counted)(x, by=x), shift(x, x), rtol=1e-6)
+    assert len(traces) == 1
