@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from diffatmo.camera import Camera, Equirectangular, Fisheye, Pinhole
     from diffatmo.compiling import compiler_options
     from diffatmo.imageio import ImageError
-    from diffatmo.models import Model, Moments, PathTrace, RayMarch, Sky, View
+    from diffatmo.models import Bruneton, Model, Moments, PathTrace, RayMarch, Sky, View
     from diffatmo.render import Scene
 
 __version__ = "0.1.0"
@@ -36,6 +36,7 @@ __version__ = "0.1.0"
 _HOME = {
     "Atmosphere": "atmosphere",
     "AtmosphereError": "atmosphere",
+    "Bruneton": "models",
     "Camera": "camera",
     "Equirectangular": "camera",
     "Fisheye": "camera",
@@ -59,6 +60,7 @@ _HOME = {
 __all__ = [
     "Atmosphere",
     "AtmosphereError",
+    "Bruneton",
     "Camera",
     "Equirectangular",
     "Fisheye",

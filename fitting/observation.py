@@ -44,6 +44,8 @@ class Observation(eqx.Module):
     sun: Float[np.ndarray, "3"]
     image: Float[np.ndarray, "height width w"]
     directions: Float[np.ndarray, "height width 3"]
+    spread: Float[np.ndarray, "height width 2 3"]
+    """Standard deviations of the directions that a pixel is the mean of, along their two axes; zero for a single one."""
     shown: Bool[np.ndarray, "height width"]
     used: Bool[np.ndarray, "height width"]
     noise: Float[np.ndarray, "height width w"]
@@ -91,7 +93,8 @@ def observe(
         exposure: ``"fixed"``, ``"free"`` (a factor of this image's own), or the name of a group of images that share
             one factor; with ``-per-channel`` appended (``"free-per-channel"``) there is one for each channel.
         exposure_value: The exposure as far as it is known: pixels = exposure_value × free factor × radiance.
-        max_pixels: Average blocks of pixels until no more than this many are used.
+        max_pixels: Average blocks of pixels until no more than this many are used. The model is averaged over four
+            directions in each block.
         name: Of the image, in messages, tables and file names.
     """
     refuse = _Refusal(name)
@@ -167,6 +170,7 @@ def observe(
         refuse("noise: it is zero for some pixels, expected a standard deviation > 0")
     block = math.ceil(math.sqrt(used.sum() / max_pixels))
     fields: dict[str, Any] = {"image": image, "directions": directions, "shown": shown, "used": used, **noises}
+    single = np.zeros((*image.shape[:2], 2, 3), dtype=np.float32)
     return Observation(
         name=name,
         exposure=exposure,
@@ -176,7 +180,7 @@ def observe(
         masked=dict(masked),
         block=block,
         camera=camera,
-        **(fields if block == 1 else _bin(fields, block)),
+        **(fields | {"spread": single} if block == 1 else _bin(fields, block)),
     )
 
 
@@ -229,8 +233,12 @@ def _bin(fields: dict[str, np.ndarray], block: int) -> dict[str, np.ndarray]:
         return finite.sum((2, 3), dtype=np.float64) / count[..., None]
 
     directions = mean("directions")
+    apart = np.where(chosen[..., None], split["directions"] - directions[:, :, None, None], 0)
+    squares = np.einsum("hwabi,hwabj->hwij", apart, apart, dtype=np.float64) / count[..., None, None]
+    variances, axes = np.linalg.eigh(squares)
+    spread = (np.sqrt(np.maximum(variances, 0))[..., None, :] * axes).swapaxes(-1, -2)[..., 1:, :]
     directions /= np.maximum(np.linalg.norm(directions, axis=-1, keepdims=True), 1e-6)
-    directions[~shown] = (0, 0, 1)
+    directions[~shown], spread[~shown] = (0, 0, 1), 0
     # Variances of independent pixels add, those of their mean are divided by the number squared.
     signal = np.maximum(mean("image"), 1e-30)
     squares = np.where(chosen[..., None], np.nan_to_num(split["noise"] * split["image"]) ** 2, 0)
@@ -239,6 +247,7 @@ def _bin(fields: dict[str, np.ndarray], block: int) -> dict[str, np.ndarray]:
     binned = {
         "image": mean("image"),
         "directions": directions,
+        "spread": spread,
         "noise": relative,
         "noise_shot": mean("noise_shot") / count[..., None],
         "noise_floor": np.sqrt(dark) / count[..., None],
@@ -257,7 +266,8 @@ class Batch(eqx.Module):
 
     altitude: Float[Array, " image"]
     sun: Float[Array, "image 3"]
-    directions: Float[Array, "image pixel 3"]
+    directions: Float[Array, "image pixel part 3"]
+    """One direction for each pixel, or four that have the mean and the variance of those it is the mean of."""
     measured: Float[Array, "image pixel w"]
     used: Bool[Array, "image pixel"]
     noise: Float[Array, "image pixel w"]
@@ -331,10 +341,16 @@ def stack(observations: Sequence[Observation], wavelengths: Sequence[float]) -> 
         array = np.asarray(value)
         return jnp.asarray(array, dtype=bool if array.dtype == bool else jnp.result_type(float))
 
+    directions = padded("directions", np.array([0, 0, 1], dtype=np.float32))[..., None, :]
+    if any(observation.block > 1 for observation in observations):
+        first, second = jnp.moveaxis(padded("spread", np.float32(0)), -2, 0)[..., None, :]
+        signs = jnp.asarray([[1, 1], [1, -1], [-1, 1], [-1, -1]], first.dtype)[..., None]
+        directions = directions + signs[:, 0] * first + signs[:, 1] * second
+        directions = directions / jnp.linalg.norm(directions, axis=-1, keepdims=True)
     return Batch(
         altitude=number([observation.altitude for observation in observations]),
         sun=number(np.stack([observation.sun for observation in observations])),
-        directions=padded("directions", np.array([0, 0, 1], dtype=np.float32)),
+        directions=directions,
         measured=jnp.nan_to_num(padded("image", np.float32(0)), posinf=0.0, neginf=0.0),
         used=padded("used", False),
         noise=padded("noise", np.float32(0)),

@@ -79,7 +79,7 @@ def predict(sky: Sky, batch: Batch) -> Predicted:
 
     def one(image: tuple[Array, Array, Array]) -> Float[Array, "pixel w"]:
         altitude, sun, directions = image
-        return sky.view(altitude=altitude, sun=sun).radiance(view=directions).radiance
+        return jnp.mean(sky.view(altitude=altitude, sun=sun).radiance(view=directions).radiance, axis=1)
 
     return jax.lax.map(one, (batch.altitude, batch.sun, batch.directions))
 
@@ -137,7 +137,7 @@ def smooth_fields(batch: Batch, degree: int) -> Float[np.ndarray, "image pixel b
 
     A sum of them with independent coefficients of variance s²/b is a random smooth function on the sky of variance s².
     """
-    directions = np.asarray(batch.directions, dtype=np.float64)
+    directions = np.asarray(batch.directions, dtype=np.float64).mean(axis=2)
     powers = [
         (i, j, k) for i in range(degree + 1) for j in range(degree + 1 - i) for k in range(min(2, degree + 1 - i - j))
     ]

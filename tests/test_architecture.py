@@ -24,11 +24,14 @@ LEVELS = [
     ["diffatmo.transmittance"],
     ["diffatmo.scattering"],
     ["diffatmo.models.base"],
-    [f"diffatmo.models.{name}" for name in ("moments.angular", "pathtrace.columns", "pathtrace.lattice")],
+    [
+        f"diffatmo.models.{name}"
+        for name in ("moments.angular", "pathtrace.columns", "pathtrace.lattice", "bruneton.tables")
+    ],
     ["diffatmo.models.moments.shell", "diffatmo.models.pathtrace.vector", "diffatmo.models.pathtrace.guide"],
-    ["diffatmo.models.moments.solve", "diffatmo.models.pathtrace.paths"],
+    ["diffatmo.models.moments.solve", "diffatmo.models.pathtrace.paths", "diffatmo.models.bruneton.precomputation"],
     ["diffatmo.models.moments.sky"],
-    ["diffatmo.models.raymarch", "diffatmo.models.moments", "diffatmo.models.pathtrace"],
+    [f"diffatmo.models.{name}" for name in ("raymarch", "moments", "bruneton", "pathtrace")],
     ["diffatmo.models"],
     ["diffatmo.render", "diffatmo.imageio"],
     ["diffatmo.scene"],

@@ -105,6 +105,27 @@ def test_binning_averages_radiance_direction_and_noise():
     assert found.noise.mean() == pytest.approx(0.1 / 4, rel=0.02)
 
 
+def test_four_directions_stand_for_a_block():
+    """The mean of 1 / (mu + 0.1), which is as steep as a sky at the horizon, over blocks of 6°, some with holes.
+
+    Mean and variance of the directions are right, so that only the third order (of the holes) and the fourth are left.
+    """
+    camera = Equirectangular(64, 128, upper=True)
+    mask = np.random.default_rng(2).uniform(size=(64, 128)) < 0.9
+
+    def sky(directions):
+        return np.asarray(1 / (directions[..., 2] + 0.1))
+
+    pixels = sky(np.asarray(camera.directions()))[..., None] * np.ones(3)
+    found = observe(pixels, camera=camera, mask=mask, max_pixels=64 * 128 // 16)
+    directions = stack([found], NM).directions
+    assert directions.shape == (1, 16 * 32, 4, 3)
+    four = sky(directions[0]).mean(axis=1).reshape(16, 32)
+    wrong, rest = (np.std((x / found.image[..., 0] - 1)[-4:]) for x in (sky(found.directions), four))
+    assert wrong > 5e-3
+    assert rest < wrong / 10
+
+
 def test_binning_leaves_masked_pixels_out():
     pixels = np.ones((32, 64, 3))
     pixels[0, 0] = np.nan

@@ -79,7 +79,7 @@ CAMERA_KEYS: dict[str, Key] = {
     "projection": Word("How pixels map to directions.", ("equirectangular", "fisheye", "pinhole")),
     "upper": Flag("The equirectangular picture ends at the horizon."),
     "fov_deg": Number("Field of view: across the circle of a fisheye, top to bottom of a pinhole.", 0.01, 360),
-    "yaw_deg": Number("Azimuth of the optical axis, clockwise from north."),
+    "yaw_deg": Number("Azimuth of the optical axis, or of a panorama's left edge, clockwise from north."),
     "pitch_deg": Number("Elevation of the optical axis.", -90, 90),
     "roll_deg": Number("Clockwise turn of the camera about its optical axis."),
 }

@@ -1,0 +1,398 @@
+"""The precomputation of Bruneton & Neyret 2008, algorithm 4.1: one function per table, in the paper's order and names.
+
+T is the transmittance, E the irradiance of the ground by the sky, S the light scattered towards a point; Δ marks what one more
+order of scattering adds. Axes: ``r``, ``m`` (mu), ``v`` (nu), ``s`` (mu_s), ``w`` (wavelength).
+
+The spherical integral of ΔJ is the paper's rule (midpoints in the polar angle and in azimuth), but in azimuth it is done term
+by term of a Fourier series: at one altitude and sun the light is sampled in every direction *once*, and the phase function
+turns each of its harmonics into one of ΔJ. The paper samples it anew for every direction that it is scattered into, 1024
+times as often.
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from diffatmo import geometry, phase, table
+from diffatmo._types import Altitude, Cosine, Irradiance, Length, Scalar, Transmittance
+from diffatmo.atmosphere import Atmosphere
+from diffatmo.models.bruneton.tables import Planet, bilinear, possible, taps
+from diffatmo.numerics import safe_divide
+
+Scattered = Float[Array, "r m v s w"]
+
+
+class Steps(NamedTuple):
+    """Quadrature counts; the defaults are those of the papers."""
+
+    transmittance: int = 500
+    single: int = 50
+    multiple: int = 50
+    density: int = 16
+    """Directions in the polar angle for ΔJ, and as many in half the azimuth."""
+    irradiance: int = 32
+    """The same for ΔE, of which the upper half is used."""
+
+
+class Tables(eqx.Module):
+    """What the precomputation leaves behind."""
+
+    transmittance: Float[Array, "r mu w"]
+    irradiance: Float[Array, "r s w"]
+    """Of the sky alone, on a horizontal plane."""
+    rayleigh: Scattered
+    """S without Rayleigh's phase function: single scattering by air, and all further orders divided by that function."""
+    mie: Scattered
+    """Single scattering by aerosol, without its phase function."""
+
+
+def compute_transmittance(atmosphere: Atmosphere, planet: Planet, steps: int) -> Float[Array, "r mu w"]:
+    """T(r, mu) to the top of the atmosphere, by the trapezoidal rule (paper, eq. 5)."""
+    altitude, mu = planet.transmittance_nodes()
+    altitude = jnp.broadcast_to(altitude[:, None], mu.shape)
+    length = geometry.distance_up(altitude, mu, planet.top_altitude, planet.bottom_radius)
+    profiles = atmosphere.rayleigh_density, atmosphere.mie_density, atmosphere.ozone_density
+
+    def step(columns: Array, i: Array) -> tuple[Array, None]:
+        here = geometry.altitude_along(altitude, mu, length * (i / steps), planet.bottom_radius)
+        weight = jnp.where((i == 0) | (i == steps), 0.5, 1.0) / steps
+        return columns + weight * jnp.stack([profile(jnp.maximum(here, 0)) for profile in profiles], axis=-1), None
+
+    columns, _ = jax.lax.scan(step, jnp.zeros((*mu.shape, 3), mu.dtype), jnp.arange(steps + 1))
+    coefficients = jnp.stack([atmosphere.rayleigh_scattering, atmosphere.mie_extinction, atmosphere.ozone_absorption])
+    depth = jnp.sum((columns * length[..., None])[..., None] * coefficients, axis=-2)
+    return jnp.exp(-depth)
+
+
+def to_top(planet: Planet, transmittance: Float[Array, "r mu w"], altitude: Altitude, mu: Cosine) -> Transmittance:
+    """T looked up, for a ray that does not meet the ground."""
+    return bilinear(transmittance, *planet.transmittance_position(altitude, mu))
+
+
+def between(
+    planet: Planet,
+    transmittance: Float[Array, "r mu w"],
+    altitude: Altitude,
+    mu: Cosine,
+    distance: Length,
+    ground: Bool[Array, "..."],
+) -> Transmittance:
+    """T over the first ``distance`` km of a ray, as a ratio of two entries of the table (paper, eq. 6)."""
+    radius = planet.bottom_radius
+    there = jnp.clip(geometry.altitude_along(altitude, mu, distance, radius), 0, planet.top_altitude)
+    mu_there = jnp.clip(((radius + altitude) * mu + distance) / (radius + there), -1, 1)
+    sign = jnp.where(ground, -1.0, 1.0)
+    here_up = to_top(planet, transmittance, altitude, sign * mu)
+    there_up = to_top(planet, transmittance, there, sign * mu_there)
+    down = ground[..., None]
+    return jnp.minimum(safe_divide(jnp.where(down, there_up, here_up), jnp.where(down, here_up, there_up)), 1)
+
+
+def sun_seen(planet: Planet, altitude: Altitude, mu_s: Cosine, sun_angular_radius: float) -> Float[Array, "..."]:
+    """Fraction of the sun's disc above the horizon, roughly: a smooth step (2017, ``GetTransmittanceToSun``)."""
+    horizon = geometry.horizon_mu(altitude, planet.bottom_radius)
+    dip_sine = planet.bottom_radius / (planet.bottom_radius + altitude)
+    t = jnp.clip((mu_s - horizon) / (2 * dip_sine * sun_angular_radius) + 0.5, 0, 1)
+    return t * t * (3 - 2 * t)
+
+
+def to_sun(
+    planet: Planet, transmittance: Float[Array, "r mu w"], altitude: Altitude, mu_s: Cosine, sun_angular_radius: float
+) -> Transmittance:
+    """T towards the sun, times the part of its disc that is up."""
+    seen = sun_seen(planet, altitude, mu_s, sun_angular_radius)
+    return to_top(planet, transmittance, altitude, mu_s) * seen[..., None]
+
+
+def compute_direct_irradiance(
+    atmosphere: Atmosphere, planet: Planet, transmittance: Float[Array, "r mu w"], sun_angular_radius: float
+) -> Float[Array, "r s w"]:
+    """ΔE of order 0: the sun on a horizontal plane; as the disc sets, the mean cosine of what is left of it."""
+    altitude, mu_s = planet.irradiance_nodes()
+    altitude, mu_s = jnp.broadcast_arrays(altitude[:, None], mu_s)
+    a = sun_angular_radius
+    setting = jnp.maximum(mu_s + a, 0) ** 2 / (4 * a)
+    cosine = jnp.where(mu_s > a, mu_s, setting)
+    return atmosphere.solar_irradiance * to_top(planet, transmittance, altitude, mu_s) * cosine[..., None]
+
+
+class _Axes(NamedTuple):
+    """The entries of S at one altitude."""
+
+    altitude: Scalar
+    mu: Float[Array, " m"]
+    ground: Bool[Array, " m"]
+    mu_s: Float[Array, " s"]
+    nu: Float[Array, "m v s"]
+    length: Length
+    """To the end of the ray; m."""
+
+
+def _axes(planet: Planet, altitude: Scalar) -> _Axes:
+    mu, mu_s, ground = planet.mu_nodes(altitude), planet.mu_s_nodes(), planet.ground_nodes()
+    nu = possible(mu[:, None, None], mu_s, planet.nu_nodes()[:, None])
+    start = jnp.broadcast_to(altitude, mu.shape)
+    length = geometry.distance_to_boundary(start, mu, ground, planet.bottom_radius, planet.top_altitude)
+    return _Axes(altitude, mu, ground, mu_s, nu, length)
+
+
+def _along(planet: Planet, axes: _Axes, distance: Float[Array, " m"]) -> tuple[Altitude, Cosine, Float[Array, "m v s"]]:
+    """Altitude, mu and mu_s at a distance along the rays."""
+    radius = planet.bottom_radius
+    there = jnp.clip(geometry.altitude_along(axes.altitude, axes.mu, distance, radius), 0, planet.top_altitude)
+    r, r_there = radius + axes.altitude, radius + there
+    mu_s = (r * axes.mu_s + distance[:, None, None] * axes.nu) / r_there[:, None, None]
+    return there, jnp.clip((r * axes.mu + distance) / r_there, -1, 1), jnp.clip(mu_s, -1, 1)
+
+
+def _trapezoid(i: Array, steps: int) -> Array:
+    return jnp.where((i == 0) | (i == steps), 0.5, 1.0) / steps
+
+
+def compute_single_scattering(
+    atmosphere: Atmosphere,
+    planet: Planet,
+    transmittance: Float[Array, "r mu w"],
+    sun_angular_radius: float,
+    steps: int,
+) -> tuple[Scattered, Scattered]:
+    """ΔS_R and ΔS_M of order 1, without phase functions (paper, eq. 7)."""
+
+    @jax.checkpoint
+    def at(altitude: Scalar) -> tuple[Array, Array]:
+        axes = _axes(planet, altitude)
+        start = jnp.broadcast_to(altitude, axes.mu.shape)
+
+        def step(sums: tuple[Array, Array], i: Array) -> tuple[tuple[Array, Array], None]:
+            distance = axes.length * (i / steps)
+            there, _, mu_s = _along(planet, axes, distance)
+            view = between(planet, transmittance, start, axes.mu, distance, axes.ground)
+            # T towards the sun: first the row of the table at this altitude, then its entries.
+            here = there[:, None, None]
+            p_r, p_mu = planet.transmittance_position(jnp.broadcast_to(here, mu_s.shape), mu_s)
+            first_r, part_r = taps(p_r[:, 0, 0], planet.sizes.transmittance_r)
+            rows = (
+                transmittance[first_r] * (1 - part_r)[:, None, None]
+                + transmittance[first_r + 1] * part_r[:, None, None]
+            )
+            first, part = taps(p_mu, planet.sizes.transmittance_mu)
+            ray = jnp.arange(rows.shape[0])[:, None, None]
+            sun = rows[ray, first] * (1 - part)[..., None] + rows[ray, first + 1] * part[..., None]
+            sun = sun * sun_seen(planet, here, mu_s, sun_angular_radius)[..., None]
+            weight = (_trapezoid(i, steps) * axes.length)[:, None] * view
+            air = weight * atmosphere.rayleigh_density(there)[:, None]
+            aerosol = weight * atmosphere.mie_density(there)[:, None]
+            return (sums[0] + air[:, None, None] * sun, sums[1] + aerosol[:, None, None] * sun), None
+
+        zero = jnp.zeros((*axes.nu.shape, transmittance.shape[-1]), axes.nu.dtype)
+        return jax.lax.scan(step, (zero, zero), jnp.arange(steps + 1))[0]
+
+    rayleigh, mie = jax.lax.map(at, planet.altitudes())
+    light = atmosphere.solar_irradiance
+    return light * atmosphere.rayleigh_scattering * rayleigh, light * atmosphere.mie_scattering * mie
+
+
+def incident(
+    planet: Planet,
+    first: tuple[Scattered, Scattered] | None,
+    further: Scattered | None,
+    atmosphere: Atmosphere,
+    altitude: Altitude,
+    mu: Cosine,
+    mu_s: Cosine,
+    nu: Cosine,
+    ground: Bool[Array, "..."],
+) -> Float[Array, "... w"]:
+    """Light of one order of scattering from a direction: ΔS, or ΔS_R and ΔS_M with their phase functions."""
+    if further is not None:
+        return look_up(planet, further, altitude, mu, mu_s, nu, ground)
+    assert first is not None
+    air, aerosol = (look_up(planet, part, altitude, mu, mu_s, nu, ground) for part in first)
+    peak = phase.mie(nu, atmosphere.mie_g, atmosphere.mie_phase)
+    return phase.rayleigh(nu)[..., None] * air + peak[..., None] * aerosol
+
+
+def look_up(
+    planet: Planet,
+    scattered: Scattered,
+    altitude: Altitude,
+    mu: Cosine,
+    mu_s: Cosine,
+    nu: Cosine,
+    ground: Bool[Array, "..."],
+) -> Float[Array, "... w"]:
+    """S between its entries, linearly along each axis."""
+    sizes = planet.sizes
+    altitude, mu, mu_s, nu, ground = jnp.broadcast_arrays(altitude, mu, mu_s, nu, ground)
+    positions = (
+        planet.altitude_position(altitude),
+        planet.mu_position(altitude, mu, ground),
+        planet.nu_position(nu),
+        planet.mu_s_position(mu_s),
+    )
+    counts = (sizes.r, sizes.mu, sizes.nu, sizes.mu_s)
+    flat = scattered.reshape(-1, scattered.shape[-1])
+    index, weight = jnp.zeros_like(positions[0], dtype=jnp.int32)[..., None], jnp.ones_like(positions[0])[..., None]
+    for position, count in zip(positions, counts, strict=True):
+        first, part = taps(position, count)
+        index = (index * count + first[..., None])[..., None] + np.arange(2)
+        index = index.reshape(*first.shape, -1)
+        weight = (weight[..., None] * jnp.stack([1 - part, part], axis=-1)[..., None, :]).reshape(*first.shape, -1)
+    return jnp.sum(flat[index] * weight[..., None], axis=-2)
+
+
+def _midpoints(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Cosines of the midpoints of ``count`` equal parts of [0, π], and the weight sinθ dθ of each."""
+    theta = (np.arange(count) + 0.5) * np.pi / count
+    return np.cos(theta), np.sin(theta) * np.pi / count
+
+
+def compute_scattering_density(
+    atmosphere: Atmosphere,
+    planet: Planet,
+    transmittance: Float[Array, "r mu w"],
+    irradiance: Float[Array, "r s w"],
+    first: tuple[Scattered, Scattered] | None,
+    further: Scattered | None,
+    count: int,
+) -> Scattered:
+    """ΔJ: light of the last order, and light of the last order reflected by the ground, scattered once more (eq. 8)."""
+    cos_theta, weight = (jnp.asarray(a, transmittance.dtype) for a in _midpoints(count))
+    sin_theta = geometry.sine(cos_theta)
+    azimuth = jnp.asarray(np.cos((np.arange(count) + 0.5) * np.pi / count), transmittance.dtype)
+    # Fourier coefficients of an even function of azimuth from its values at the midpoints.
+    harmonics = jnp.asarray(table.chebyshev_coefficients(count), transmittance.dtype)
+
+    @jax.checkpoint
+    def at(altitude: Scalar) -> Array:
+        axes = _axes(planet, altitude)
+        start = jnp.broadcast_to(altitude, cos_theta.shape)
+        ground = geometry.hits_ground(start, cos_theta, planet.bottom_radius)
+        # Where the light comes from; axes θ, φ, s.
+        mu, mu_s = cos_theta[:, None, None], axes.mu_s
+        nu = mu * mu_s + sin_theta[:, None, None] * geometry.sine(mu_s) * azimuth[:, None]
+        light = incident(planet, first, further, atmosphere, altitude, mu, mu_s, nu, ground[:, None, None])
+        to_ground = geometry.distance_down(start, cos_theta, jnp.zeros_like(start), planet.bottom_radius)
+        to_ground = jnp.where(ground, to_ground, 0)
+        survives = between(planet, transmittance, start, cos_theta, to_ground, ground)
+        mu_s_ground = ((planet.bottom_radius + altitude) * mu_s + to_ground[:, None, None] * nu) / planet.bottom_radius
+        falling = bilinear(
+            irradiance, *planet.irradiance_position(jnp.zeros_like(mu_s_ground), jnp.clip(mu_s_ground, -1, 1))
+        )
+        reflected = (atmosphere.ground_albedo / jnp.pi * survives)[:, None, None] * falling
+        light = light + jnp.where(ground[:, None, None, None], reflected, 0)
+        light = jnp.einsum("nf,tfsw->ntsw", harmonics, light) * weight[:, None, None]
+        # The phase functions' harmonics in the azimuth between where light comes from and where it goes.
+        turn = axes.mu[:, None, None] * mu[..., 0] + (geometry.sine(axes.mu)[:, None] * sin_theta)[..., None] * azimuth
+        air = phase.rayleigh(turn) @ harmonics.T
+        aerosol = phase.mie(turn, atmosphere.mie_g, atmosphere.mie_phase) @ harmonics.T
+        once = jnp.ones(count, turn.dtype).at[1:].set(0.5) * 2 * jnp.pi
+        air_density = atmosphere.rayleigh_density(altitude) * atmosphere.rayleigh_scattering
+        aerosol_density = atmosphere.mie_density(altitude) * atmosphere.mie_scattering
+        scattered = air_density * jnp.einsum("mtn,ntsw->mnsw", air * once, light) + aerosol_density * jnp.einsum(
+            "mtn,ntsw->mnsw", aerosol * once, light
+        )
+        sines = geometry.sine(axes.mu)[:, None, None] * geometry.sine(axes.mu_s)
+        cosine = jnp.clip(safe_divide(axes.nu - axes.mu[:, None, None] * axes.mu_s, sines), -1, 1)
+        multiples = table.chebyshev(count, cosine)
+        return jnp.einsum("mvsn,mnsw->mvsw", multiples, scattered)
+
+    return jax.lax.map(at, planet.altitudes())
+
+
+def compute_indirect_irradiance(
+    atmosphere: Atmosphere,
+    planet: Planet,
+    first: tuple[Scattered, Scattered] | None,
+    further: Scattered | None,
+    count: int,
+) -> Float[Array, "r s w"]:
+    """ΔE: light of one order of scattering on a horizontal plane (paper, eq. 10)."""
+    altitudes, mu_s = planet.irradiance_nodes()
+    cos_theta, weight = (jnp.asarray(a[: count // 2], mu_s.dtype) for a in _midpoints(count))
+    azimuth = jnp.asarray(np.cos((np.arange(count) + 0.5) * np.pi / count), mu_s.dtype)
+    mu = cos_theta[:, None, None]
+    nu = mu * mu_s + geometry.sine(mu) * geometry.sine(mu_s) * azimuth[:, None]
+
+    def at(altitude: Scalar) -> Array:
+        light = incident(planet, first, further, atmosphere, altitude, mu, mu_s, nu, jnp.zeros(nu.shape, bool))
+        return 2 * jnp.pi * jnp.einsum("t,tsw->sw", weight * cos_theta, jnp.mean(light, axis=1))
+
+    return jax.lax.map(jax.checkpoint(at), altitudes)
+
+
+def compute_multiple_scattering(
+    planet: Planet, transmittance: Float[Array, "r mu w"], density: Scattered, steps: int
+) -> Scattered:
+    """ΔS: what ΔJ sends towards a point along every ray (paper, eq. 11)."""
+    sizes = planet.sizes
+    by_ray = density.reshape(sizes.r * sizes.mu, sizes.nu * sizes.mu_s, density.shape[-1])
+
+    @jax.checkpoint
+    def at(altitude: Scalar) -> Array:
+        axes = _axes(planet, altitude)
+        start = jnp.broadcast_to(altitude, axes.mu.shape)
+        ray = jnp.arange(sizes.mu)[:, None, None]
+        first_nu, part_nu = taps(planet.nu_position(axes.nu), sizes.nu)
+
+        def step(total: Array, i: Array) -> tuple[Array, None]:
+            distance = axes.length * (i / steps)
+            there, mu, mu_s = _along(planet, axes, distance)
+            # First along r and mu, which are common to all suns, then along nu and mu_s.
+            (ir, fr), (im, fm) = (
+                taps(planet.altitude_position(there), sizes.r),
+                taps(planet.mu_position(there, mu, axes.ground), sizes.mu),
+            )
+            weight = (_trapezoid(i, steps) * axes.length)[:, None]
+            view = between(planet, transmittance, start, axes.mu, distance, axes.ground) * weight
+            corners = ((0, 0, (1 - fr) * (1 - fm)), (0, 1, (1 - fr) * fm), (1, 0, fr * (1 - fm)), (1, 1, fr * fm))
+            rows = sum(part[:, None, None] * by_ray[(ir + a) * sizes.mu + im + b] for a, b, part in corners)
+            rows = rows * view[:, None]
+            first_s, part_s = taps(planet.mu_s_position(mu_s), sizes.mu_s)
+            entry = first_nu * sizes.mu_s + first_s
+            light = jnp.zeros((), rows.dtype)
+            for a, wa in ((0, 1 - part_nu), (1, part_nu)):
+                for b, wb in ((0, 1 - part_s), (1, part_s)):
+                    light = light + (wa * wb)[..., None] * rows[ray, entry + a * sizes.mu_s + b]
+            return total + light, None
+
+        zero = jnp.zeros((*axes.nu.shape, density.shape[-1]), axes.nu.dtype)
+        return jax.lax.scan(step, zero, jnp.arange(steps + 1))[0]
+
+    return jax.lax.map(at, planet.altitudes())
+
+
+def precompute(
+    atmosphere: Atmosphere, planet: Planet, *, orders: int, steps: Steps, sun_angular_radius: float
+) -> Tables:
+    """All tables, by the paper's algorithm 4.1 with ``orders`` orders of scattering."""
+    transmittance = compute_transmittance(atmosphere, planet, steps.transmittance)
+    delta_e = compute_direct_irradiance(atmosphere, planet, transmittance, sun_angular_radius)
+    rayleigh, mie = compute_single_scattering(atmosphere, planet, transmittance, sun_angular_radius, steps.single)
+    irradiance, total = jnp.zeros_like(delta_e), rayleigh
+    toward = jax.vmap(lambda altitude: phase.rayleigh(_axes(planet, altitude).nu))(planet.altitudes())[..., None]
+
+    def order(
+        first: tuple[Scattered, Scattered] | None, further: Scattered | None, delta_e: Irradiance
+    ) -> tuple[Scattered, Irradiance]:
+        density = compute_scattering_density(atmosphere, planet, transmittance, delta_e, first, further, steps.density)
+        falling = compute_indirect_irradiance(atmosphere, planet, first, further, steps.irradiance)
+        return compute_multiple_scattering(planet, transmittance, density, steps.multiple), falling
+
+    if orders > 1:
+        delta_s, delta_e = order((rayleigh, mie), None, delta_e)
+        irradiance, total = irradiance + delta_e, total + delta_s / toward
+        if orders > 2:
+
+            def next_order(carry: Any, _: None) -> tuple[Any, None]:
+                delta_s, delta_e, irradiance, total = carry
+                delta_s, delta_e = order(None, delta_s, delta_e)
+                return (delta_s, delta_e, irradiance + delta_e, total + delta_s / toward), None
+
+            carry = (delta_s, delta_e, irradiance, total)
+            (_, _, irradiance, total), _ = jax.lax.scan(next_order, carry, None, length=orders - 2)
+    return Tables(transmittance, irradiance, total, mie)
