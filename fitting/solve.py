@@ -71,8 +71,20 @@ REJECTIONS_AT_MOST = 11
 LONGEST_STEP = 3.0
 """In natural units: what the derivatives say of a parameter e³ times as large is not worth an evaluation."""
 
+LARGEST_SIGNAL = 1e9
+"""Signal over noise, of a pixel, whose square can be summed in single precision."""
+
 LARGEST_CORRECTION = 1.25
 """Factor beyond which a finer model is no correction any more."""
+
+LARGEST_DEVIATION = 0.03
+"""RMS of the correction, in any image, beyond which the model is too coarse for the atmosphere that was found."""
+
+LARGEST_MISFIT = 100.0
+"""Reduced χ² up to which residuals are taken for noise that may hide an optimum; beyond it the model is wrong somewhere."""
+
+HOPELESS_MISFIT = 1e4
+"""Reduced χ² of images that have nothing to do with the model: another unit, another exposure."""
 
 REMAINING = 1 / 5
 """Error of a finer model over the difference to the coarser one: at most that for ``Moments`` against Monte Carlo in
@@ -88,6 +100,10 @@ RANK_TOLERANCE = 3e-5
 
 INTERRUPTED = "interrupted by the user"
 OUT_OF_STEPS = "stopped: not converged in the steps allowed"
+UNLIKE = (
+    "the images are not of such a sky: residuals are {:.0f} times the noise; are exposure, units, camera and sun right?"
+)
+TOO_COARSE = "converged, but the model's finer self differs from it by {:.0%}: the error bars do not hold"
 
 # The test for convergence is made here, so optimistix's own is set out of reach. Its trust region trusts a step only if
 # 99 % of the predicted fall of χ² came true, and then takes hundreds of steps along the curved valleys that images with
@@ -166,6 +182,13 @@ def _projected(
     return projected(slope, expected, fields, problem)
 
 
+def _deviation(problem: Problem) -> Float[np.ndarray, "image w"]:
+    """RMS of the correction over the used pixels of every image."""
+    used = np.asarray(problem.batch.used)
+    deviation = np.where(used[..., None], np.asarray(problem.correction) - 1, 0)
+    return np.sqrt((deviation**2).sum(axis=1) / np.maximum(used.sum(axis=1), 1)[:, None])
+
+
 def _model_error(best: "_Point", problem: Problem) -> Float[np.ndarray, "n n"]:
     """Covariance of the coordinates from what the correction leaves of the model's error.
 
@@ -173,10 +196,7 @@ def _model_error(best: "_Point", problem: Problem) -> Float[np.ndarray, "n n"]:
     function of direction, half of its variance common to all channels and half of each channel's own. Its amplitude is the
     RMS of the correction there.
     """
-    used = np.asarray(problem.batch.used)
-    deviation = np.where(used[..., None], np.asarray(problem.correction) - 1, 0)
-    count = np.maximum(used.sum(axis=1), 1)[:, None]
-    amplitude = REMAINING * np.sqrt((deviation**2).sum(axis=1) / count)
+    amplitude = REMAINING * _deviation(problem)
     fields = smooth_fields(problem.batch, FIELD_DEGREE)
     pushes = np.asarray(
         outermost(_projected)(best.y, best.linearisation, jnp.asarray(fields, best.y.dtype), problem), dtype=np.float64
@@ -218,9 +238,9 @@ def distance(factor: Float[np.ndarray, "n+1 n+1"], misfit: float = 1.0) -> float
 
     Its square is the amount by which χ² / ``misfit`` would still fall if the residuals were linear; the variance of the
     noise is taken to be ``misfit`` times the stated one. A direction with the standard error s, in natural units of the
-    coordinates, counts by 1 / (1 + s²).
+    coordinates, counts by 1 / (1 + s²); there a misfit counts up to :data:`LARGEST_MISFIT`.
     """
-    left, singular, _ = np.linalg.svd(factor[:, :-1] / math.sqrt(misfit), full_matrices=False)
+    left, singular, _ = np.linalg.svd(factor[:, :-1] / math.sqrt(min(misfit, LARGEST_MISFIT)), full_matrices=False)
     along = left.T @ factor[:, -1] / math.sqrt(misfit)
     return math.sqrt(np.sum(along**2 * singular**2 / (1 + singular**2)))
 
@@ -351,6 +371,20 @@ def _check_finite(start: Linearisation, batch: Batch, names: Sequence[str]) -> N
                 raise FitError(f"{name}: the model's {what} at the start: not finite in {count} of the pixels used")
 
 
+def _check_weights(batch: Batch, names: Sequence[str]) -> None:
+    """Refuse pixels whose noise single precision cannot square and divide by."""
+    with np.errstate(all="ignore"):
+        whitened = np.asarray(batch.measured / sigma(batch, batch.measured))
+    bad = np.asarray(batch.used) & ~(np.isfinite(whitened) & (whitened < LARGEST_SIGNAL)).all(axis=-1)
+    bad |= np.asarray(batch.used) & ((whitened == 0) & (np.asarray(batch.measured) != 0)).any(axis=-1)
+    for name, count in zip(names, bad.sum(axis=1), strict=True):
+        if count:
+            raise FitError(
+                f"{name}: signal and noise: {count} pixels are too bright, too dark or too exact for their numbers; expected a "
+                f"noise between {1 / LARGEST_SIGNAL:g} and 1e18 times the signal, and signals from 1e-15 to 1e15"
+            )
+
+
 def _weigh(problem: Problem, expected: Array) -> Problem:
     """``problem`` with the weights of pixels whose expected signal is ``expected``."""
     weight = jnp.where(problem.batch.used[..., None], 1 / sigma(problem.batch, expected), 0)
@@ -403,6 +437,7 @@ def solve(
             f"{_count(batch)} pixels and channels cannot determine {size} parameters; mask less or free less"
         )
     # Three programs, the longest first, compiled at the same time.
+    _check_weights(batch, [observation.name for observation in observations])
     signal, of_planet = batch.measured, eqx.filter_eval_shape(planet_shell, model, parameters)
     problem = Problem(model, parameters, batch, signal, of_planet, jnp.ones_like(signal))
     compiling = [compile_ahead(linearise, parameters.start, problem)]
@@ -444,8 +479,14 @@ def solve(
             start = Linearisation(radiance * correction, best.linearisation.tangents * correction[..., None])
             best = search(best.y, start, problem, tolerance=tolerance)
             model_error = _model_error(best, problem)
+            deviation = float(_deviation(problem).max())
+            if best.converged and deviation > LARGEST_DEVIATION:
+                best = best._replace(converged=False, message=TOO_COARSE.format(deviation))
         except KeyboardInterrupt:
             best = best._replace(converged=False, message=INTERRUPTED)
+    misfit = float(np.sum(best.triangle[:, -1] ** 2)) / max(_count(batch) - size, 1)
+    if best.converged and misfit > HOPELESS_MISFIT:
+        best = best._replace(converged=False, message=UNLIKE.format(math.sqrt(misfit)))
     total = time.perf_counter() - started
     # What a typical evaluation does not explain is compilation and preparation, which happen once.
     evaluations = min(total, len(seconds) * float(np.median(seconds)))

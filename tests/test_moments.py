@@ -1,5 +1,7 @@
 """The default model against independent Monte Carlo, against itself at other resolutions, and at its limits."""
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -9,12 +11,21 @@ import pytest
 from diffatmo.atmosphere import earth
 from diffatmo.models.moments import Moments
 from diffatmo.models.moments.angular import azimuthal, norms, orders, pairs, plane, polar
+from diffatmo.models.moments.shell import Directions
 from diffatmo.models.raymarch import RayMarch
 
 
 def directions(zenith_deg, azimuth_deg):
     z, a = np.radians(zenith_deg), np.radians(azimuth_deg)
     return jnp.asarray(np.stack([np.sin(z) * np.sin(a), np.sin(z) * np.cos(a), np.cos(z)], -1), jnp.result_type(float))
+
+
+QUICK = Moments(
+    altitudes=6, suns=10, first=Directions(4, 3, 3, 3, 4), iterate=Directions(3, 2, 3, 2, 2), last=Directions(3, 2, 4, 2, 3),
+    source_degree=3, peak_azimuths=6, order=3, view_steps=4, view_sky=9, view_ground=7, view_columns=5,
+    view_fine_columns=9,
+)  # fmt: skip
+"""Few nodes, for what does not depend on their number."""
 
 
 @eqx.filter_jit
@@ -170,3 +181,27 @@ def test_haze_does_not_depend_on_the_resolution(s1):
         finer = radiance(Moments().finer(), air, jnp.asarray(0.5), view, sun).radiance
         error = np.asarray(default) / np.asarray(finer) - 1
         assert np.sqrt(np.mean(error**2)) < limit
+
+
+@partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
+def seen_and_slopes(radius, top, altitude):
+    """Radiance upwards, straight down and just beside that, and its derivatives by the radii and the altitude."""
+    view = jnp.asarray([[0.0, 0.6, 0.8], [0.0, 0.0, -1.0], [0.0, 0.005, -0.9999875]])
+
+    def light(radius, top, altitude):
+        air = eqx.tree_at(lambda a: (a.bottom_radius, a.top_radius), earth(), (radius, radius + top))
+        return QUICK.sky(air).view(altitude=altitude, sun=directions(50.0, 0.0)).radiance(view=view).radiance
+
+    return light(radius, top, altitude), jax.jacfwd(light, (0, 1, 2))(radius, top, altitude)
+
+
+@pytest.mark.parametrize(
+    ("radius", "top", "altitude"),
+    [(6360.0, 1.0, 0.1), (6360.0, 20.0, 0.1), (70000.0, 80.0, 0.1), (1000.0, 0.1, 0.01), (6360.0, 100.0, 4e5)],
+)
+def test_thin_shells_and_far_observers_are_finite(radius, top, altitude):
+    """In float32: the fall of the light at dusk, and a planet smaller than a degree."""
+    value, slopes = seen_and_slopes(*[jnp.asarray(x, jnp.float32) for x in (radius, top, altitude)])
+    assert bool((value >= 0).all())
+    assert bool((value[1] > 0).all())
+    assert all(bool(jnp.isfinite(slope).all()) for slope in slopes)

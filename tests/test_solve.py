@@ -213,3 +213,48 @@ def test_model_error_covers_a_fifth_of_the_correction():
     blind = fit(images, init=toy_sky.start(), free=FREE, model=LessCrude()).with_truth(toy_sky.truth())
     assert max(abs(e.pull) for e in blind.parameters) > 5
     assert max(abs(e.pull) for e in found.parameters) < 3
+
+
+def test_a_model_too_coarse_for_the_sky_does_not_count_as_converged():
+    """Its finer self differs by more than a correction may: the best point is kept, and the message says why."""
+
+    class Coarse(Toy):
+        def finer(self):
+            return Finer()
+
+    class Finer(Toy):
+        def sky(self, atmosphere):
+            return FinerSky(atmosphere)
+
+    class FinerSky(toy_sky.ToySky):
+        def radiance(self, *, altitude, view, sun):
+            exact = super().radiance(altitude=altitude, view=view, sun=sun)
+            return Ray(exact.radiance * (1 + 0.1 * view[..., 2:]), exact.transmittance)
+
+    found = fit(toy_sky.observations(), init=toy_sky.start(), free=FREE, model=Coarse())
+    assert not found.converged
+    assert "finer self differs" in found.message
+
+
+@pytest.mark.parametrize("factor", [1e3, 1e6])
+def test_images_in_another_unit_do_not_converge(factor):
+    """The start, where every derivative is nothing beside the residual, is no optimum."""
+    images = [
+        eqx.tree_at(lambda o: o.image, image, image.image * np.float32(factor)) for image in toy_sky.observations()
+    ]
+    images = [eqx.tree_at(lambda o: o.noise_floor, image, image.noise_floor * np.float32(factor)) for image in images]
+    found = fit(images, init=toy_sky.start(), free=["rayleigh_scattering", "mie_g"], model=Toy())
+    assert not found.converged
+    assert all(np.isfinite(estimate.value) for estimate in found.parameters)
+
+
+@pytest.mark.parametrize(("factor", "noise"), [(1e-19, 0.01), (1e30, 0.01), (1.0, 1e-30)])
+def test_numbers_that_single_precision_cannot_square_are_refused(factor, noise):
+    image = toy_sky.observations()[0]
+    changed = eqx.tree_at(
+        lambda o: (o.image, o.noise, o.noise_shot, o.noise_floor),
+        image,
+        (image.image * np.float32(factor), 0 * image.noise + np.float32(noise), 0 * image.noise, 0 * image.noise),
+    )
+    with pytest.raises(FitError, match="sun 30: signal and noise: "):
+        fit([changed], init=toy_sky.start(), free=["mie_g"], model=Toy())

@@ -101,6 +101,7 @@ class Job:
     free: tuple[str, ...]
     scaled: tuple[str, ...]
     model: str
+    refine: bool
     max_steps: int
 
 
@@ -112,16 +113,19 @@ def prepare(spec: FitSpec) -> Job:
     init = read_atmosphere(spec.init or "earth")
     free, scaled = spec.free if spec.free is not None else FREE, spec.scaled or ()
     select(init, free, scaled)
-    observed = [observe(image, name, init) for image, name in zip(spec.images, image_names(spec.images), strict=True)]
+    seen = [observe(image, name, init) for image, name in zip(spec.images, image_names(spec.images), strict=True)]
     # Images of different atmospheres have no truth in common.
-    truths = {dumps(truth): truth for _, truth in observed if truth is not None}
+    truths = {dumps(truth): truth for truth in (image.truth for image in seen) if truth is not None}
+    model = spec.model or MODELS[0]
     return Job(
-        observations=[observation for observation, _ in observed],
+        observations=[image.observation for image in seen],
         init=init,
         truth=next(iter(truths.values())) if len(truths) == 1 else None,
         free=tuple(free),
         scaled=tuple(scaled),
-        model=spec.model or MODELS[0],
+        model=model,
+        # A finer model would correct what is not wrong in images that the model itself has made.
+        refine=any(image.model != model for image in seen),
         max_steps=spec.max_steps or MAX_STEPS,
     )
 
@@ -148,6 +152,11 @@ def run(job: Job, directory: Path, *, overwrite: bool) -> bool:
     count = len(job.observations)
     console.print(f"\n[bold]{directory.name}[/]: {count} image{'s' * (count > 1)}, free: {', '.join(job.free)}")
 
+    for observation in job.observations:
+        if observation.block > 1:
+            size = f"{observation.block}×{observation.block}"
+            console.print(f"  {observation.name}: {observation.used.sum()} averages of {size} pixels")
+
     def show(step: "Step") -> None:
         mark = "" if step.accepted else "  (rejected)"
         console.print(f"  step {step.step:3}  reduced χ² {step.reduced_chi2:<10.5g}  {step.seconds:.2f} s{mark}")
@@ -161,6 +170,7 @@ def run(job: Job, directory: Path, *, overwrite: bool) -> bool:
             model=make_model(job.model),
             progress=show,
             max_steps=job.max_steps,
+            refine=job.refine,
         )
         report.write(result, directory, truth=job.truth, overwrite=overwrite)
     console.print(report.table(result, job.truth))

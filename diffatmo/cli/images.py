@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from diffatmo.cli.common import InputError
 from diffatmo.cli.keys import CAMERA_KEYS, flag_of, make_camera
@@ -25,8 +25,17 @@ NOISE_KEYS = ("noise", "noise_shot", "noise_floor")
 SAME_WAVELENGTH_NM = 0.01
 
 
-def observe(spec: ImageSpec, name: str, init: "Atmosphere") -> "tuple[Observation, Atmosphere | None]":
-    """The image as an observation called ``name``, and the true atmosphere if the image carries it.
+class Seen(NamedTuple):
+    """An image to be fitted, and what its header says about where it comes from."""
+
+    observation: "Observation"
+    truth: "Atmosphere | None"
+    model: str | None
+    """That rendered it."""
+
+
+def observe(spec: ImageSpec, name: str, init: "Atmosphere") -> Seen:
+    """The image as an observation called ``name``.
 
     What ``spec`` does not say is taken from the image's header; what neither says is asked for.
     """
@@ -59,7 +68,7 @@ def observe(spec: ImageSpec, name: str, init: "Atmosphere") -> "tuple[Observatio
         )
     except ValueError as error:
         raise InputError(f"{spec.file}: {str(error).removeprefix(f'{name}: ')}") from error
-    return observation, truth_of(shot, init) if shot else None
+    return Seen(observation, truth_of(shot, init) if shot else None, notes.get("model"))
 
 
 def in_order(image: "Image", init: "Atmosphere") -> "np.ndarray":

@@ -181,10 +181,11 @@ def dusk(mu_s: Cosine, scale: Scalar) -> Float[Array, "..."]:
     """How the light falls as the sun sinks, roughly: divided out of the moments before they are interpolated.
 
     exp(-s²/(1 + s/4)) with s the depth of the sun in units of ``scale``: the height of the shadow over a scale height, bent
-    down to what light from the side adds. A scaling only: it cancels at the nodes.
+    down to what light from the side adds. A scaling only: it cancels at the nodes. Where an atmosphere is thin compared with
+    its planet it ends at e^-36, whose square single precision can divide by.
     """
     depth = jnp.maximum(-mu_s, 0) / scale
-    return jnp.exp(-depth * depth / (1 + depth / 4))
+    return jnp.exp(-jnp.minimum(depth * depth / (1 + depth / 4), 36))
 
 
 def _link(

@@ -18,7 +18,7 @@ from diffatmo.models.moments.solve import Degrees, State, gather, source_moments
 from diffatmo.numerics import safe_divide, safe_sqrt
 
 ZENITH_WIDTH = 0.02
-"""Half-width of the range of nu tabulated where view or sun is at the zenith, and azimuth has no meaning."""
+"""Least half-width of the range of nu that is tabulated, where view or sun is at the zenith, and azimuth has no meaning."""
 
 SKY_LINEAR = 0.02
 GROUND_LINEAR = 0.1
@@ -131,6 +131,8 @@ class _Rows(eqx.Module):
     altitude: Scalar
     horizon: Cosine
     highest: Cosine
+    widening: Scalar
+    """Least half-width of the range of nu that is tabulated; from afar, that of the planet is small as well."""
     nadir_distance: Length
     horizon_distance: Length
     sky: int = eqx.field(static=True)
@@ -145,7 +147,8 @@ class _Rows(eqx.Module):
         highest = jnp.where(outside, geometry.horizon_mu(over, radius + top), 1.0)
         reach = safe_sqrt(altitude * (altitude + 2 * radius))
         return cls(
-            altitude, geometry.horizon_mu(altitude, radius), highest, altitude, reach,
+            altitude, geometry.horizon_mu(altitude, radius), highest,
+            ZENITH_WIDTH * jnp.where(outside, geometry.sine(highest), 1.0), altitude, reach,
             resolution.sky_rows, resolution.ground_rows,
         )  # fmt: skip
 
@@ -159,6 +162,10 @@ class _Rows(eqx.Module):
         ground = -safe_divide(h * (h + 2 * radius) + distance * distance, 2 * r * distance, 1.0)
         return jnp.concatenate([sky, jnp.clip(ground, -1, self.horizon)])
 
+    def half_width(self, mu: Cosine, mu_s: Cosine) -> Cosine:
+        """Half-width of the range of nu tabulated at ``mu``: sinθ sinθ_s, kept from vanishing."""
+        return safe_sqrt((1 - mu * mu) * (1 - mu_s * mu_s) + self.widening * self.widening)
+
     def locate(self, mu: Cosine, ground: Bool[Array, "..."], radius: Scalar) -> tuple[Int[Array, "..."], Array]:
         """First row and four weights for interpolation at ``mu``; the two parts of the table do not mix."""
         up = jnp.clip(safe_divide(mu - self.horizon, self.highest - self.horizon), 0, 1)
@@ -170,11 +177,6 @@ class _Rows(eqx.Module):
             jnp.where(ground, self.sky + below[0], above[0]),
             jnp.where(ground[..., None], below[1], above[1]),
         )
-
-
-def _half_width(mu: Cosine, mu_s: Cosine) -> Cosine:
-    """Half-width of the range of nu tabulated at ``mu``: sinθ sinθ_s, kept from vanishing."""
-    return safe_sqrt((1 - mu * mu) * (1 - mu_s * mu_s) + ZENITH_WIDTH * ZENITH_WIDTH)
 
 
 class MomentsView(View):
@@ -201,7 +203,7 @@ class MomentsView(View):
         ground = jnp.arange(mu.size) >= size.sky_rows
         x = jnp.asarray(table.chebyshev_nodes(size.columns), mu.dtype)
         mu_s = sun[2]
-        nu = mu[:, None] * mu_s + _half_width(mu, mu_s)[:, None] * x
+        nu = mu[:, None] * mu_s + rows.half_width(mu, mu_s)[:, None] * x
         start, mu_in, mu_s_in, _, misses = geometry.enter_atmosphere(
             jnp.broadcast_to(altitude, (mu.size, 1)), mu[:, None], mu_s, nu, radius, top
         )
@@ -264,7 +266,7 @@ class MomentsView(View):
         mu, mu_s, nu = view[..., 2], self.sun[2], view @ self.sun
         ground = mu < self.rows.horizon
         row, row_weights = self.rows.locate(mu, ground, radius)
-        x = (nu - mu * mu_s) / _half_width(mu, mu_s)
+        x = (nu - mu * mu_s) / self.rows.half_width(mu, mu_s)
         columns = self.table.shape[1]
         column, column_weights = table.cubic_weights(0.5 * (jnp.clip(x, -1, 1) + 1), columns)
         patch = jax.vmap(lambda r, c: jax.lax.dynamic_slice(self.table, (r, c, 0 * r), (4, 4, self.table.shape[2])))
@@ -288,4 +290,5 @@ class MomentsView(View):
         seen = view[..., 2] <= self.rows.highest
         depth = sum(row_weights[..., a, None] * self.log_transmittance[row + a] for a in range(4))
         transmittance_: Transmittance = jnp.exp(jnp.minimum(depth, 0))
-        return Ray(jnp.where(seen[..., None], light, 0), jnp.where(seen[..., None], transmittance_, 1))
+        # Between light and darkness a local cubic may undershoot.
+        return Ray(jnp.where(seen[..., None], jnp.maximum(light, 0), 0), jnp.where(seen[..., None], transmittance_, 1))
