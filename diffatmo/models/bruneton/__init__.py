@@ -12,7 +12,16 @@ from diffatmo import geometry, phase
 from diffatmo._types import Altitude, Cosine, Irradiance, Length
 from diffatmo.atmosphere import Atmosphere
 from diffatmo.models.base import Model, Path, Sky
-from diffatmo.models.bruneton.precomputation import Steps, Tables, between, look_up, precompute, to_sun, to_top
+from diffatmo.models.bruneton.precomputation import (
+    Steps,
+    Tables,
+    between,
+    look_up,
+    precompute,
+    to_ground,
+    to_sun,
+    to_top,
+)
 from diffatmo.models.bruneton.tables import PARAMETERISATIONS, Planet, Sizes, bilinear
 from diffatmo.numerics import safe_divide
 
@@ -91,7 +100,7 @@ class BrunetonSky(Sky):
         end = geometry.distance_to_boundary(altitude, mu, ground, radius, top)
         air, aerosol = self._scattered(altitude, mu, mu_s, nu, ground)
         if distance is None:
-            through = between(planet, self.tables.transmittance, altitude, mu, jnp.where(ground, end, 0), ground)
+            through = to_ground(planet, self.tables.transmittance, altitude, mu, ground)
             survives = jnp.where(ground[..., None], through, to_top(planet, self.tables.transmittance, altitude, mu))
         else:
             # S(a→b) = S(a→c) - T(a→b) S(b→c), c the end of the ray (paper, section 4).

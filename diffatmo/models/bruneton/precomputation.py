@@ -81,9 +81,33 @@ def between(
     distance: Length,
     ground: Bool[Array, "..."],
 ) -> Transmittance:
-    """T over the first ``distance`` km of a ray, as a ratio of two entries of the table (paper, eq. 6)."""
+    """T over the first ``distance`` km of a ray."""
     radius = planet.bottom_radius
     there = jnp.clip(geometry.altitude_along(altitude, mu, distance, radius), 0, planet.top_altitude)
+    return _ratio(planet, transmittance, altitude, mu, there, distance, ground)
+
+
+def to_ground(
+    planet: Planet, transmittance: Float[Array, "r mu w"], altitude: Altitude, mu: Cosine, ground: Bool[Array, "..."]
+) -> Transmittance:
+    """T down to the ground; 1 for a ray that is not said to meet it."""
+    zero = jnp.zeros_like(altitude)
+    distance = jnp.where(ground, geometry.distance_down(altitude, mu, zero, planet.bottom_radius), 0)
+    # The altitude there is 0, not nearly 0: the position in the table goes as its square root.
+    return _ratio(planet, transmittance, altitude, mu, jnp.where(ground, zero, altitude), distance, ground)
+
+
+def _ratio(
+    planet: Planet,
+    transmittance: Float[Array, "r mu w"],
+    altitude: Altitude,
+    mu: Cosine,
+    there: Altitude,
+    distance: Length,
+    ground: Bool[Array, "..."],
+) -> Transmittance:
+    """T between two points of a ray, as a ratio of two entries of the table (paper, eq. 6)."""
+    radius = planet.bottom_radius
     mu_there = jnp.clip(((radius + altitude) * mu + distance) / (radius + there), -1, 1)
     sign = jnp.where(ground, -1.0, 1.0)
     here_up = to_top(planet, transmittance, altitude, sign * mu)
@@ -276,10 +300,11 @@ def compute_scattering_density(
         mu, mu_s = cos_theta[:, None, None], axes.mu_s
         nu = mu * mu_s + sin_theta[:, None, None] * geometry.sine(mu_s) * azimuth[:, None]
         light = incident(planet, first, further, atmosphere, altitude, mu, mu_s, nu, ground[:, None, None])
-        to_ground = geometry.distance_down(start, cos_theta, jnp.zeros_like(start), planet.bottom_radius)
-        to_ground = jnp.where(ground, to_ground, 0)
-        survives = between(planet, transmittance, start, cos_theta, to_ground, ground)
-        mu_s_ground = ((planet.bottom_radius + altitude) * mu_s + to_ground[:, None, None] * nu) / planet.bottom_radius
+        reach = jnp.where(
+            ground, geometry.distance_down(start, cos_theta, jnp.zeros_like(start), planet.bottom_radius), 0
+        )
+        survives = to_ground(planet, transmittance, start, cos_theta, ground)
+        mu_s_ground = ((planet.bottom_radius + altitude) * mu_s + reach[:, None, None] * nu) / planet.bottom_radius
         falling = bilinear(
             irradiance, *planet.irradiance_position(jnp.zeros_like(mu_s_ground), jnp.clip(mu_s_ground, -1, 1))
         )
