@@ -14,7 +14,7 @@ test: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	XLA_FLAGS=$(COMPILE_FAST) $(BIN)/pytest -n 2 --dist loadfile
+	XLA_FLAGS=$(COMPILE_FAST) $(BIN)/pytest -n 2 --dist worksteal
 
 $(READY): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "diffatmo needs Python 3.11 or newer; say which with: make PYTHON=/path/to/python3")'

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from diffatmo.camera import Camera, Equirectangular, Fisheye, Pinhole
     from diffatmo.compiling import compiler_options
     from diffatmo.imageio import ImageError
-    from diffatmo.models import Bruneton, Model, Moments, PathTrace, RayMarch, Sky, View
+    from diffatmo.models import Bruneton, Hillaire, Model, Moments, PathTrace, RayMarch, Sky, View
     from diffatmo.render import Scene
 
 __version__ = "0.1.0"
@@ -40,6 +40,7 @@ _HOME = {
     "Camera": "camera",
     "Equirectangular": "camera",
     "Fisheye": "camera",
+    "Hillaire": "models",
     "ImageError": "imageio",
     "Model": "models",
     "Moments": "models",
@@ -64,6 +65,7 @@ __all__ = [
     "Camera",
     "Equirectangular",
     "Fisheye",
+    "Hillaire",
     "ImageError",
     "Model",
     "Moments",

@@ -23,15 +23,14 @@ LEVELS = [
     ["diffatmo.rays", "diffatmo.atmosphere"],
     ["diffatmo.transmittance"],
     ["diffatmo.scattering"],
-    ["diffatmo.models.base"],
-    [
-        f"diffatmo.models.{name}"
-        for name in ("moments.angular", "pathtrace.columns", "pathtrace.lattice", "bruneton.tables")
-    ],
+    ["diffatmo.models.base", "diffatmo.models.tables"],
+    ["diffatmo.models.transmittance_table"],
+    [f"diffatmo.models.{name}" for name in ("moments.angular", "pathtrace.columns", "pathtrace.lattice")],
     ["diffatmo.models.moments.shell", "diffatmo.models.pathtrace.vector", "diffatmo.models.pathtrace.guide"],
     ["diffatmo.models.moments.solve", "diffatmo.models.pathtrace.paths", "diffatmo.models.bruneton.precomputation"],
+    ["diffatmo.models.hillaire.luts"],
     ["diffatmo.models.moments.sky"],
-    [f"diffatmo.models.{name}" for name in ("raymarch", "moments", "bruneton", "pathtrace")],
+    [f"diffatmo.models.{name}" for name in ("raymarch", "moments", "bruneton", "hillaire", "pathtrace")],
     ["diffatmo.models"],
     ["diffatmo.render", "diffatmo.imageio"],
     ["diffatmo.scene"],
@@ -95,10 +94,14 @@ def test_only_the_command_line_sees_fitting(module):
         assert not {name for name in imports(MODULES[module]) if name.startswith("fitting")}
 
 
+COMMON = ("base", "tables", "transmittance_table")
+"""What several models build on."""
+
+
 def model(module: str) -> str | None:
     """The model a module belongs to."""
     parts = module.split(".")
-    return parts[2] if parts[:2] == ["diffatmo", "models"] and len(parts) > 2 and parts[2] != "base" else None
+    return parts[2] if parts[:2] == ["diffatmo", "models"] and len(parts) > 2 and parts[2] not in COMMON else None
 
 
 @pytest.mark.parametrize("module", [name for name in MODULES if model(name)])

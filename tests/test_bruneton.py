@@ -10,9 +10,10 @@ import pytest
 
 from diffatmo.atmosphere import earth
 from diffatmo.models.bruneton import Bruneton, Planet, Sizes, Steps
-from diffatmo.models.bruneton.precomputation import look_up, to_top
-from diffatmo.models.bruneton.tables import PARAMETERISATIONS, bilinear
+from diffatmo.models.bruneton.precomputation import look_up
 from diffatmo.models.raymarch import RayMarch
+from diffatmo.models.tables import PARAMETERISATIONS, bilinear
+from diffatmo.models.transmittance_table import to_top
 
 SMALL = Bruneton(sizes=Sizes(32, 128, 8, 32, 16, 64, 24, 8), steps=Steps(64, 20, 20, 8, 16), orders=2)
 

@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 from diffatmo.atmosphere import earth
+from diffatmo.models import hillaire
 from diffatmo.models.bruneton import Bruneton, Sizes, Steps
+from diffatmo.models.hillaire import Hillaire
 from diffatmo.models.moments import Moments
 from diffatmo.models.moments.shell import Directions
 from diffatmo.models.raymarch import RayMarch
@@ -32,7 +34,8 @@ COMPILE_FAST = {"xla_backend_optimization_level": 0}
 
 TABLES = Bruneton(sizes=Sizes(8, 16, 4, 8, 4, 8, 6, 4), steps=Steps(19, 5, 5, 4, 4), orders=3)
 """19: with 20, samples of the vertical ray would fall on the very edges of the absorber, where its slope jumps."""
-MODELS = {"moments": SMALL, "bruneton": TABLES, "raymarch": RayMarch(steps=4)}
+LUTS = Hillaire((16, 8), (6, 6), (12, 12), hillaire.Steps(19, 5, 5, 5, 3))
+MODELS = {"moments": SMALL, "bruneton": TABLES, "hillaire": LUTS, "raymarch": RayMarch(steps=4)}
 
 
 def unit(zenith_deg, azimuth_deg):
@@ -61,7 +64,7 @@ def make(model, atmosphere, how):
     return radiance
 
 
-CASES = [("moments", "view"), ("bruneton", "path"), ("raymarch", "path")]
+CASES = [("moments", "view"), ("bruneton", "path"), ("hillaire", "view"), ("raymarch", "path")]
 
 
 @pytest.mark.parametrize(("name", "how"), CASES)
@@ -76,7 +79,7 @@ def test_forward_and_reverse_against_differences(x64, name, how):
     x = pack(50.0, 0.7)
     exact = forward(x)
     # Linear interpolation has two derivatives at the entries of a table, and rounding chooses.
-    rtol = 1e-6 if name == "bruneton" else 1e-8
+    rtol = 1e-6 if name in ("bruneton", "hillaire") else 1e-8
     np.testing.assert_allclose(reverse(x), jnp.tensordot(weight, exact, 2), rtol=rtol, atol=1e-12)
     for i in range(x.size):
         step = 1e-5 * max(1.0, abs(float(x[i])))

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from diffatmo.atmosphere import Atmosphere
     from diffatmo.models import Model
 
-MODELS = ("moments", "bruneton", "raymarch", "pathtrace")
+MODELS = ("moments", "bruneton", "hillaire", "raymarch", "pathtrace")
 """Names of ``diffatmo.models.MODELS``, repeated here because importing that takes seconds; a test compares the two."""
 
 

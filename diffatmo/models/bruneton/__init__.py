@@ -1,8 +1,8 @@
 """Precomputed atmospheric scattering (Bruneton & Neyret 2008, and Bruneton's revision of 2017), as it is.
 
-The tables are computed by :mod:`.precomputation` over the coordinates of :mod:`.tables`. What the method costs in accuracy is
-part of it: linear interpolation of eight entries in nu, the product of all further orders with Rayleigh's phase function,
-ratios of transmittances. Where that matters, :class:`~diffatmo.models.moments.Moments` is the model to use.
+The tables are computed by :mod:`.precomputation` over the coordinates of :mod:`diffatmo.models.tables`. What the method costs
+in accuracy is part of it: linear interpolation of eight entries in nu, the product of all further orders with Rayleigh's phase
+function, ratios of transmittances. Where that matters, :class:`~diffatmo.models.moments.Moments` is the model to use.
 """
 
 import jax.numpy as jnp
@@ -12,17 +12,9 @@ from diffatmo import geometry, phase
 from diffatmo._types import Altitude, Cosine, Irradiance, Length
 from diffatmo.atmosphere import Atmosphere
 from diffatmo.models.base import Model, Path, Sky
-from diffatmo.models.bruneton.precomputation import (
-    Steps,
-    Tables,
-    between,
-    look_up,
-    precompute,
-    to_ground,
-    to_sun,
-    to_top,
-)
-from diffatmo.models.bruneton.tables import PARAMETERISATIONS, Planet, Sizes, bilinear
+from diffatmo.models.bruneton.precomputation import Steps, Tables, look_up, precompute
+from diffatmo.models.tables import PARAMETERISATIONS, Planet, Sizes, bilinear
+from diffatmo.models.transmittance_table import between, to_ground, to_sun, to_top
 from diffatmo.numerics import safe_divide
 
 __all__ = ["Bruneton", "BrunetonSky", "Planet", "Sizes", "Steps", "Tables"]

@@ -18,9 +18,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from diffatmo import geometry, phase, table
-from diffatmo._types import Altitude, Cosine, Irradiance, Length, Scalar, Transmittance
+from diffatmo._types import Altitude, Cosine, Irradiance, Length, Scalar
 from diffatmo.atmosphere import Atmosphere
-from diffatmo.models.bruneton.tables import Planet, bilinear, possible, taps
+from diffatmo.models.tables import Planet, bilinear, possible, taps
+from diffatmo.models.transmittance_table import between, compute_transmittance, sun_seen, to_ground, to_top
 from diffatmo.numerics import safe_divide
 
 Scattered = Float[Array, "r m v s w"]
@@ -48,88 +49,6 @@ class Tables(eqx.Module):
     """S without Rayleigh's phase function: single scattering by air, and all further orders divided by that function."""
     mie: Scattered
     """Single scattering by aerosol, without its phase function."""
-
-
-def compute_transmittance(atmosphere: Atmosphere, planet: Planet, steps: int) -> Float[Array, "r mu w"]:
-    """T(r, mu) to the top of the atmosphere, by the trapezoidal rule (paper, eq. 5)."""
-    altitude, mu = planet.transmittance_nodes()
-    altitude = jnp.broadcast_to(altitude[:, None], mu.shape)
-    length = geometry.distance_up(altitude, mu, planet.top_altitude, planet.bottom_radius)
-    profiles = atmosphere.rayleigh_density, atmosphere.mie_density, atmosphere.ozone_density
-
-    def step(columns: Array, i: Array) -> tuple[Array, None]:
-        here = geometry.altitude_along(altitude, mu, length * (i / steps), planet.bottom_radius)
-        weight = jnp.where((i == 0) | (i == steps), 0.5, 1.0) / steps
-        return columns + weight * jnp.stack([profile(jnp.maximum(here, 0)) for profile in profiles], axis=-1), None
-
-    columns, _ = jax.lax.scan(step, jnp.zeros((*mu.shape, 3), mu.dtype), jnp.arange(steps + 1))
-    coefficients = jnp.stack([atmosphere.rayleigh_scattering, atmosphere.mie_extinction, atmosphere.ozone_absorption])
-    depth = jnp.sum((columns * length[..., None])[..., None] * coefficients, axis=-2)
-    return jnp.exp(-depth)
-
-
-def to_top(planet: Planet, transmittance: Float[Array, "r mu w"], altitude: Altitude, mu: Cosine) -> Transmittance:
-    """T looked up, for a ray that does not meet the ground."""
-    return bilinear(transmittance, *planet.transmittance_position(altitude, mu))
-
-
-def between(
-    planet: Planet,
-    transmittance: Float[Array, "r mu w"],
-    altitude: Altitude,
-    mu: Cosine,
-    distance: Length,
-    ground: Bool[Array, "..."],
-) -> Transmittance:
-    """T over the first ``distance`` km of a ray."""
-    radius = planet.bottom_radius
-    there = jnp.clip(geometry.altitude_along(altitude, mu, distance, radius), 0, planet.top_altitude)
-    return _ratio(planet, transmittance, altitude, mu, there, distance, ground)
-
-
-def to_ground(
-    planet: Planet, transmittance: Float[Array, "r mu w"], altitude: Altitude, mu: Cosine, ground: Bool[Array, "..."]
-) -> Transmittance:
-    """T down to the ground; 1 for a ray that is not said to meet it."""
-    zero = jnp.zeros_like(altitude)
-    distance = jnp.where(ground, geometry.distance_down(altitude, mu, zero, planet.bottom_radius), 0)
-    # The altitude there is 0, not nearly 0: the position in the table goes as its square root.
-    return _ratio(planet, transmittance, altitude, mu, jnp.where(ground, zero, altitude), distance, ground)
-
-
-def _ratio(
-    planet: Planet,
-    transmittance: Float[Array, "r mu w"],
-    altitude: Altitude,
-    mu: Cosine,
-    there: Altitude,
-    distance: Length,
-    ground: Bool[Array, "..."],
-) -> Transmittance:
-    """T between two points of a ray, as a ratio of two entries of the table (paper, eq. 6)."""
-    radius = planet.bottom_radius
-    mu_there = jnp.clip(((radius + altitude) * mu + distance) / (radius + there), -1, 1)
-    sign = jnp.where(ground, -1.0, 1.0)
-    here_up = to_top(planet, transmittance, altitude, sign * mu)
-    there_up = to_top(planet, transmittance, there, sign * mu_there)
-    down = ground[..., None]
-    return jnp.minimum(safe_divide(jnp.where(down, there_up, here_up), jnp.where(down, here_up, there_up)), 1)
-
-
-def sun_seen(planet: Planet, altitude: Altitude, mu_s: Cosine, sun_angular_radius: float) -> Float[Array, "..."]:
-    """Fraction of the sun's disc above the horizon, roughly: a smooth step (2017, ``GetTransmittanceToSun``)."""
-    horizon = geometry.horizon_mu(altitude, planet.bottom_radius)
-    dip_sine = planet.bottom_radius / (planet.bottom_radius + altitude)
-    t = jnp.clip((mu_s - horizon) / (2 * dip_sine * sun_angular_radius) + 0.5, 0, 1)
-    return t * t * (3 - 2 * t)
-
-
-def to_sun(
-    planet: Planet, transmittance: Float[Array, "r mu w"], altitude: Altitude, mu_s: Cosine, sun_angular_radius: float
-) -> Transmittance:
-    """T towards the sun, times the part of its disc that is up."""
-    seen = sun_seen(planet, altitude, mu_s, sun_angular_radius)
-    return to_top(planet, transmittance, altitude, mu_s) * seen[..., None]
 
 
 def compute_direct_irradiance(
