@@ -91,19 +91,22 @@ class BrunetonSky(Sky):
         ground = geometry.hits_ground(altitude, mu, radius)
         end = geometry.distance_to_boundary(altitude, mu, ground, radius, top)
         air, aerosol = self._scattered(altitude, mu, mu_s, nu, ground)
-        if distance is None:
-            through = to_ground(planet, self.tables.transmittance, altitude, mu, ground)
-            survives = jnp.where(ground[..., None], through, to_top(planet, self.tables.transmittance, altitude, mu))
-        else:
+        down = to_ground(planet, self.tables.transmittance, altitude, mu, ground)
+        survives = jnp.where(ground[..., None], down, to_top(planet, self.tables.transmittance, altitude, mu))
+        if distance is not None:
             # S(a→b) = S(a→c) - T(a→b) S(b→c), c the end of the ray (paper, section 4).
             reach = jnp.clip(distance - moved, 0, end)
-            survives = between(planet, self.tables.transmittance, altitude, mu, reach, ground)
+            whole = reach >= end
+            part = between(planet, self.tables.transmittance, altitude, mu, reach, ground)
+            survives = jnp.where(whole[..., None], survives, part)
             there = jnp.clip(geometry.altitude_along(altitude, mu, reach, radius), 0, top)
             mu_there = jnp.clip(((radius + altitude) * mu + reach) / (radius + there), -1, 1)
             mu_s_there = jnp.clip(((radius + altitude) * mu_s + reach * nu) / (radius + there), -1, 1)
-            air_there, aerosol_there = self._scattered(there, mu_there, mu_s_there, nu, ground)
-            air = jnp.maximum(air - survives * air_there, 0)
-            aerosol = jnp.maximum(aerosol - survives * aerosol_there, 0)
+            beyond = self._scattered(there, mu_there, mu_s_there, nu, ground)
+            air, aerosol = (
+                jnp.where(whole[..., None], all_of_it, jnp.maximum(all_of_it - part * rest, 0))
+                for all_of_it, rest in zip((air, aerosol), beyond, strict=True)
+            )
         light = (
             phase.rayleigh(nu)[..., None] * air
             + phase.mie(nu, self.atmosphere.mie_g, self.atmosphere.mie_phase)[..., None] * aerosol
