@@ -13,10 +13,13 @@ from diffatmo._types import Direction, Radiance, Scalar
 from diffatmo.atmosphere import Atmosphere
 from diffatmo.camera import Camera
 from diffatmo.constants import SUN_ANGULAR_RADIUS
-from diffatmo.models import Model, Moments, View
+from diffatmo.models import Model, Moments, Path, View
 
 TILE_PIXELS = 2**16
 """Pixels computed at a time; bounds the memory of a large picture."""
+
+TILE_PATHS = 2**12
+"""Rays to a given depth computed at a time: each is integrated on its own."""
 
 RESOLVED = 20.0
 """Diameter of the sun in pixels from which its disc is evaluated pixel by pixel."""
@@ -77,6 +80,35 @@ def render(
     if sun_disc:
         picture = picture + jnp.where(resolved, 0, _small_sun(scene, view, sun_angular_radius))
     return jnp.where(scene.camera.valid()[..., None], scene.exposure * picture, 0)
+
+
+@eqx.filter_jit
+def aerial_perspective(scene: Scene, depth: Float[Array, "height width"], model: Model | None = None) -> Path:
+    """Light and transmittance between the camera and what each pixel shows, ``depth`` km away along its ray.
+
+    An object of radiance L is seen as L · transmittance + inscatter (:func:`composite`). A depth beyond the end of the ray,
+    also an infinite one, counts as the end. The inscatter is multiplied by the scene's exposure; pixels outside a fisheye's
+    circle have none. ``model`` is :class:`Moments` by default.
+    """
+    sky = (model or Moments()).sky(scene.atmosphere)
+    # Finite, so that the derivative in depth is as well; no ray inside an atmosphere is longer than its circumference.
+    longest = 2 * jnp.pi * (scene.atmosphere.top_radius + scene.altitude)
+
+    def tile(row: tuple[Array, Array]) -> Path:
+        directions, far = row
+        mu, nu = directions[..., 2], directions @ scene.sun
+        level, mu_s = (jnp.broadcast_to(jnp.asarray(x, mu.dtype), mu.shape) for x in (scene.altitude, scene.sun[2]))
+        return sky.path(altitude=level, mu=mu, mu_s=mu_s, nu=nu, distance=jnp.clip(far, 0, longest))
+
+    rows = max(1, TILE_PATHS // scene.camera.width)
+    path = jax.lax.map(tile, (scene.camera.directions(), jnp.asarray(depth)), batch_size=min(rows, scene.camera.height))
+    valid = scene.camera.valid()[..., None]
+    return Path(jnp.where(valid, scene.exposure * path.inscatter, 0), jnp.where(valid, path.transmittance, 1))
+
+
+def composite(colour: Radiance, air: Path) -> Radiance:
+    """Things of radiance ``colour``, in the exposure of the picture, behind the air in front of them."""
+    return colour * air.transmittance + air.inscatter
 
 
 def _clear(scene: Scene, directions: Direction, transmittance: Radiance) -> Radiance:
