@@ -10,6 +10,14 @@ from diffatmo.atmosphere import Atmosphere
 from diffatmo.models.tables import Planet, bilinear
 from diffatmo.numerics import safe_divide
 
+SUN_ANGULAR_RADIUS = 0.00935 / 2
+"""rad; that of Bruneton's demonstration of 2017. Over this range of its height the sun sets."""
+
+
+def trapezoid(i: Array, steps: int) -> Array:
+    """Weight of point ``i`` of 0 … ``steps`` in the mean over a ray, by the trapezoidal rule."""
+    return jnp.where((i == 0) | (i == steps), 0.5, 1.0) / steps
+
 
 def compute_transmittance(atmosphere: Atmosphere, planet: Planet, steps: int) -> Float[Array, "r mu w"]:
     """T(r, mu) to the top of the atmosphere, by the trapezoidal rule (paper, eq. 5)."""
@@ -20,8 +28,9 @@ def compute_transmittance(atmosphere: Atmosphere, planet: Planet, steps: int) ->
 
     def step(columns: Array, i: Array) -> tuple[Array, None]:
         here = geometry.altitude_along(altitude, mu, length * (i / steps), planet.bottom_radius)
-        weight = jnp.where((i == 0) | (i == steps), 0.5, 1.0) / steps
-        return columns + weight * jnp.stack([profile(jnp.maximum(here, 0)) for profile in profiles], axis=-1), None
+        return columns + trapezoid(i, steps) * jnp.stack(
+            [profile(jnp.maximum(here, 0)) for profile in profiles], axis=-1
+        ), None
 
     columns, _ = jax.lax.scan(step, jnp.zeros((*mu.shape, 3), mu.dtype), jnp.arange(steps + 1))
     coefficients = jnp.stack([atmosphere.rayleigh_scattering, atmosphere.mie_extinction, atmosphere.ozone_absorption])

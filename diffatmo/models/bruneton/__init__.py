@@ -14,13 +14,10 @@ from diffatmo.atmosphere import Atmosphere
 from diffatmo.models.base import Model, Path, Sky
 from diffatmo.models.bruneton.precomputation import Steps, Tables, look_up, precompute
 from diffatmo.models.tables import PARAMETERISATIONS, Planet, Sizes, bilinear
-from diffatmo.models.transmittance_table import between, to_ground, to_sun, to_top
+from diffatmo.models.transmittance_table import SUN_ANGULAR_RADIUS, between, to_ground, to_sun, to_top
 from diffatmo.numerics import safe_divide
 
 __all__ = ["Bruneton", "BrunetonSky", "Planet", "Sizes", "Steps", "Tables"]
-
-SUN_ANGULAR_RADIUS = 0.00935 / 2
-"""rad; that of Bruneton's demonstration of 2017."""
 
 
 class Bruneton(Model):

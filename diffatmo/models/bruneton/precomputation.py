@@ -21,7 +21,7 @@ from diffatmo import geometry, phase, table
 from diffatmo._types import Altitude, Cosine, Irradiance, Length, Scalar
 from diffatmo.atmosphere import Atmosphere
 from diffatmo.models.tables import Planet, bilinear, possible, taps
-from diffatmo.models.transmittance_table import between, compute_transmittance, sun_seen, to_ground, to_top
+from diffatmo.models.transmittance_table import between, compute_transmittance, sun_seen, to_ground, to_top, trapezoid
 from diffatmo.numerics import safe_divide
 
 Scattered = Float[Array, "r m v s w"]
@@ -92,10 +92,6 @@ def _along(planet: Planet, axes: _Axes, distance: Float[Array, " m"]) -> tuple[A
     return there, jnp.clip((r * axes.mu + distance) / r_there, -1, 1), jnp.clip(mu_s, -1, 1)
 
 
-def _trapezoid(i: Array, steps: int) -> Array:
-    return jnp.where((i == 0) | (i == steps), 0.5, 1.0) / steps
-
-
 def compute_single_scattering(
     atmosphere: Atmosphere,
     planet: Planet,
@@ -126,7 +122,7 @@ def compute_single_scattering(
             ray = jnp.arange(rows.shape[0])[:, None, None]
             sun = rows[ray, first] * (1 - part)[..., None] + rows[ray, first + 1] * part[..., None]
             sun = sun * sun_seen(planet, here, mu_s, sun_angular_radius)[..., None]
-            weight = (_trapezoid(i, steps) * axes.length)[:, None] * view
+            weight = (trapezoid(i, steps) * axes.length)[:, None] * view
             air = weight * atmosphere.rayleigh_density(there)[:, None]
             aerosol = weight * atmosphere.mie_density(there)[:, None]
             return (sums[0] + air[:, None, None] * sun, sums[1] + aerosol[:, None, None] * sun), None
@@ -291,7 +287,7 @@ def compute_multiple_scattering(
                 taps(planet.altitude_position(there), sizes.r),
                 taps(planet.mu_position(there, mu, axes.ground), sizes.mu),
             )
-            weight = (_trapezoid(i, steps) * axes.length)[:, None]
+            weight = (trapezoid(i, steps) * axes.length)[:, None]
             view = between(planet, transmittance, start, axes.mu, distance, axes.ground) * weight
             corners = ((0, 0, (1 - fr) * (1 - fm)), (0, 1, (1 - fr) * fm), (1, 0, fr * (1 - fm)), (1, 1, fr * fm))
             rows = sum(part[:, None, None] * by_ray[(ir + a) * sizes.mu + im + b] for a, b, part in corners)

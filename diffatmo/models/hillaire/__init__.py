@@ -13,9 +13,9 @@ from diffatmo._types import Altitude, Cosine, Direction, Irradiance, Length, Sca
 from diffatmo.atmosphere import Atmosphere
 from diffatmo.camera import Camera
 from diffatmo.models.base import Model, Path, Ray, Sky, View
-from diffatmo.models.hillaire.luts import SUN_ANGULAR_RADIUS, Luts, SkyView, Steps, cast, compute, march
+from diffatmo.models.hillaire.luts import Luts, SkyView, Steps, cast, compute, march
 from diffatmo.models.tables import Planet, Sizes, bilinear, taps
-from diffatmo.models.transmittance_table import to_ground, to_sun, to_top
+from diffatmo.models.transmittance_table import SUN_ANGULAR_RADIUS, to_ground, to_sun, to_top
 
 __all__ = ["AerialVolume", "Hillaire", "HillaireSky", "HillaireView", "Luts", "SkyView", "Steps"]
 

@@ -17,11 +17,8 @@ from diffatmo._types import Altitude, Cosine, Length, Radiance, Scalar, Transmit
 from diffatmo.atmosphere import Atmosphere
 from diffatmo.models.base import Path
 from diffatmo.models.tables import Planet, bilinear
-from diffatmo.models.transmittance_table import compute_transmittance, to_sun
+from diffatmo.models.transmittance_table import SUN_ANGULAR_RADIUS, compute_transmittance, to_sun
 from diffatmo.numerics import safe_arccos, safe_divide, safe_sqrt
-
-SUN_ANGULAR_RADIUS = 0.00935 / 2
-"""rad. Over this range of its height the sun sets."""
 
 
 class Steps(NamedTuple):
