@@ -20,6 +20,13 @@ from diffatmo.models.transmittance_table import SUN_ANGULAR_RADIUS, to_ground, t
 __all__ = ["AerialVolume", "Hillaire", "HillaireSky", "HillaireView", "Luts", "SkyView", "Steps"]
 
 
+IRRADIANCE_SIZE = 64
+"""Suns for which the irradiance of the ground by the sky is tabulated; they crowd about the horizon."""
+
+LOWEST_SUN = -0.3
+"""mu_s of the lowest of them."""
+
+
 class Hillaire(Model):
     """The model of Hillaire 2020.
 
@@ -44,8 +51,12 @@ class Hillaire(Model):
 
     def sky(self, atmosphere: Atmosphere) -> "HillaireSky":
         """Compute the tables that do not depend on the camera."""
-        sizes = Sizes(transmittance_mu=self.transmittance_size[0], transmittance_r=self.transmittance_size[1])
-        planet = Planet(atmosphere.bottom_radius, atmosphere.top_altitude, -0.2, sizes, "2017")
+        sizes = Sizes(
+            transmittance_mu=self.transmittance_size[0],
+            transmittance_r=self.transmittance_size[1],
+            mu_s=IRRADIANCE_SIZE,
+        )
+        planet = Planet(atmosphere.bottom_radius, atmosphere.top_altitude, LOWEST_SUN, sizes, "2017")
         luts = compute(atmosphere, planet, self.multiple_size, self.steps)
         return HillaireSky(atmosphere, planet, luts, self.sky_view_size, self.steps)
 
@@ -72,8 +83,7 @@ class HillaireSky(Sky):
 
     def sky_irradiance(self, *, mu_s: Cosine) -> Irradiance:
         """Diffuse irradiance of the sky on the ground."""
-        count = self.luts.irradiance.shape[0]
-        first, part = taps((jnp.clip(mu_s, -1, 1) + 1) / 2 * (count - 1), count)
+        first, part = taps(self.planet.mu_s_position(mu_s), self.luts.irradiance.shape[0])
         weight = part[..., None]
         return self.luts.irradiance[first] * (1 - weight) + self.luts.irradiance[first + 1] * weight
 

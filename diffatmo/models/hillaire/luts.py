@@ -39,7 +39,7 @@ class Luts(eqx.Module):
     multiple: Float[Array, "s h w"]
     """Ψ_ms (eq. 10) over mu_s in [-1, 1] and altitude, for the given solar irradiance."""
     irradiance: Float[Array, "s w"]
-    """Of the ground by the sky, over mu_s: not in the paper, whose ground sees the sun only."""
+    """Of the ground by the sky, over mu_s as in Bruneton's S: not in the paper, whose ground sees the sun only."""
 
 
 class Medium(NamedTuple):
@@ -185,7 +185,7 @@ def compute(atmosphere: Atmosphere, planet: Planet, multiple_size: tuple[int, in
     transmittance = compute_transmittance(atmosphere, planet, steps.transmittance)
     multiple = compute_multiple(atmosphere, planet, transmittance, multiple_size, steps.multiple, steps.directions)
     # Irradiance of the ground: the sky marched in a few directions, weighted by their cosine.
-    mu_s = jnp.linspace(-1, 1, multiple_size[0])
+    mu_s = planet.mu_s_nodes()
     middle = (np.arange(steps.directions) + 0.5) / steps.directions
     mu = jnp.asarray(np.sqrt(middle), mu_s.dtype)[:, None, None]
     azimuths = jnp.asarray(np.cos(np.pi * middle), mu_s.dtype)[:, None]

@@ -26,10 +26,11 @@ from diffatmo.models.base import Model, Path, Ray, Sky
 from diffatmo.models.pathtrace import columns, guide, vector
 from diffatmo.models.pathtrace.guide import Guide
 from diffatmo.models.pathtrace.paths import Rays, trace
+from diffatmo.models.pathtrace.slab import slab
 from diffatmo.models.pathtrace.vector import Vector
 from diffatmo.numerics import safe_divide
 
-__all__ = ["PathTrace", "PathTraceSky"]
+__all__ = ["Estimate", "Orders", "PathTrace", "PathTraceSky", "slab"]
 
 FINE = 64
 """Panels for what is integrated once and handed out: the transmittance of the ray, the sun's irradiance."""
@@ -86,6 +87,19 @@ class Estimate(NamedTuple):
     transmittance: Transmittance
 
 
+class Orders(NamedTuple):
+    """Light arriving along a ray by what happened to it. Parts of the same paths: their errors are correlated."""
+
+    single: Estimate
+    """Scattered once, by air or aerosol."""
+    second: Estimate
+    """Scattered or reflected twice."""
+    higher: Estimate
+    """Three times or more."""
+    ground: Estimate
+    """Reflected once by the ground at the end of the ray."""
+
+
 class PathTraceSky(Sky):
     """A sky that answers by tracing paths. The same question gets the same answer; another ``key`` another sample."""
 
@@ -99,6 +113,13 @@ class PathTraceSky(Sky):
     ) -> Estimate:
         """Radiance with its standard error; arguments as for :meth:`radiance`, another ``key`` for another sample."""
         return _ask(self, altitude, view, sun, jnp.inf, True, self.key if key is None else key)
+
+    def orders(self, *, altitude: Altitude, view: Direction, sun: Direction, key: PRNGKeyArray | None = None) -> Orders:
+        """The same light by orders of scattering: what each approximation of the other models is held against."""
+        parts = _ask(self, altitude, view, sun, jnp.inf, True, self.key if key is None else key, apart=True)
+        return Orders(
+            *(Estimate(parts.radiance[i], parts.stderr[i], parts.transmittance) for i in range(len(Orders._fields)))
+        )
 
     def radiance(self, *, altitude: Altitude, view: Direction, sun: Direction) -> Ray:
         """Radiance and transmittance along unit vectors ``view`` for a sun in direction ``sun``, shapes (..., 3)."""
@@ -146,14 +167,18 @@ def _ask(
     key: PRNGKeyArray,
     *,
     hemisphere: bool = False,
+    apart: bool = False,
 ) -> Estimate:
-    """Answer for rays of any shape, from anywhere; ``ground`` says whether light of the ground counts."""
+    """Answer for rays of any shape, from anywhere; ``ground`` says whether light of the ground counts.
+
+    Asked for ``apart``, radiance and its error have the parts as a leading axis.
+    """
     components = (*jnp.moveaxis(view, -1, 0), *jnp.moveaxis(sun, -1, 0))
     rays = jnp.broadcast_arrays(altitude, reach, ground, *components)
     shape, dtype = rays[0].shape, sky.atmosphere.bottom_radius.dtype
     altitude, reach, sees_ground, x, y, z, *sun_flat = (ray.ravel().astype(dtype) for ray in rays)
-    answers = _estimate(sky, altitude, (x, y, z), tuple(sun_flat), reach, sees_ground > 0, key, hemisphere)
-    return Estimate(*(answer.reshape(*shape, -1) for answer in answers))
+    answers = _estimate(sky, altitude, (x, y, z), tuple(sun_flat), reach, sees_ground > 0, key, hemisphere, apart)
+    return Estimate(*(answer.reshape(*answer.shape[:-2], *shape, answer.shape[-1]) for answer in answers))
 
 
 @eqx.filter_jit
@@ -166,10 +191,11 @@ def _estimate(
     ground: Bool[Array, " rays"],
     key: PRNGKeyArray,
     hemisphere: bool,
+    apart: bool,
 ) -> Estimate:
     """The same for a list of rays: one compilation serves every question of its length."""
     rays = _enter(sky.atmosphere, altitude, view, sun, reach, ground)
-    mean, error = _average(sky, rays, key, hemisphere)
+    mean, error = (x if apart else x[0] for x in _average(sky, rays, key, hemisphere, apart))
     return Estimate(mean, error, jnp.moveaxis(_transmittance(sky.atmosphere, rays), 0, -1))
 
 
@@ -197,8 +223,8 @@ def _transmittance(atmosphere: Atmosphere, rays: Rays) -> Float[Array, "w rays"]
 
 
 def _average(
-    sky: PathTraceSky, rays: Rays, key: PRNGKeyArray, hemisphere: bool
-) -> tuple[Float[Array, "rays w"], Float[Array, "rays w"]]:
+    sky: PathTraceSky, rays: Rays, key: PRNGKeyArray, hemisphere: bool, apart: bool
+) -> tuple[Float[Array, "part rays w"], Float[Array, "part rays w"]]:
     """Mean over the paths of each ray and its standard error, a chunk of rays at a time."""
     samples, replicates, lanes, panels = sky.resolution
     number = rays.altitude.size
@@ -215,7 +241,7 @@ def _average(
     )
     first = jnp.tile(jnp.arange(shares, dtype=jnp.uint32), group * replicates)
 
-    def chunk(arguments: tuple[Rays, Array]) -> Float[Array, "group replicate w"]:
+    def chunk(arguments: tuple[Rays, Array]) -> Float[Array, "part w group replicate"]:
         some, bits = arguments
 
         def spread(x: Array) -> Array:
@@ -232,13 +258,15 @@ def _average(
             stride=shares,
             panels=panels,
             hemisphere=hemisphere,
+            apart=apart,
         )
-        return jnp.sum(total.reshape(-1, group, replicates, shares), axis=-1) / points
+        return jnp.sum(total.reshape(*total.shape[:2], group, replicates, shares), axis=-1) / points
 
     def split(x: Array) -> Array:
         padded = jnp.concatenate([x, jnp.broadcast_to(x[-1:], (chunks * group - number, *x.shape[1:]))])
         return padded.reshape(chunks, group, *x.shape[1:])
 
-    means = jnp.moveaxis(jax.lax.map(chunk, jax.tree.map(split, (rays, bits))), 1, -1)
-    means = means.reshape(chunks * group, replicates, -1)[:number]
-    return jnp.mean(means, axis=1), jnp.std(means, axis=1, ddof=1) / math.sqrt(replicates)
+    means = jax.lax.map(chunk, jax.tree.map(split, (rays, bits)))
+    # Axes: part, ray, wavelength, replicate.
+    means = means.transpose(1, 0, 3, 2, 4).reshape(means.shape[1], chunks * group, -1, replicates)[:, :number]
+    return jnp.mean(means, axis=-1), jnp.std(means, axis=-1, ddof=1) / math.sqrt(replicates)

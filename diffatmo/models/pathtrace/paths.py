@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, UInt32
 
 from diffatmo import geometry, phase
@@ -51,6 +52,10 @@ class Rays(NamedTuple):
     """Whether the ground at the end of the ray counts."""
 
 
+PARTS = 4
+"""Parts of the light told apart: by the order of scattering 1, 2, 3 and more, and the sunlit ground seen directly."""
+
+
 class State(NamedTuple):
     """A path at a vertex, about to look along its next ray."""
 
@@ -58,8 +63,10 @@ class State(NamedTuple):
     up: Vector
     direction: Vector
     weight: Float[Array, "w lanes"]
+    vertex: UInt32[Array, " lanes"]
+    """How often it has been scattered or reflected."""
     stream: Stream
-    total: Float[Array, "w lanes"]
+    total: Float[Array, "part w lanes"]
     """Of all paths of the lane."""
 
 
@@ -200,10 +207,12 @@ def trace(
     stride: int,
     panels: int,
     hemisphere: bool = False,
-) -> Float[Array, "w lanes"]:
+    apart: bool = False,
+) -> Float[Array, "part w lanes"]:
     """Sum over each lane's samples ``first``, ``first + stride``, … below ``count`` (a power of two) of the radiance.
 
-    With ``hemisphere`` the sky's irradiance on the horizontal plane at ``rays.altitude`` instead, whatever their view.
+    With ``hemisphere`` the sky's irradiance on the horizontal plane at ``rays.altitude`` instead, whatever their view. All
+    light is one part, unless the ``PARTS`` are wanted ``apart``.
     """
     radius, top = atmosphere.bottom_radius, atmosphere.top_altitude
     dtype = rays.altitude.dtype
@@ -214,6 +223,7 @@ def trace(
     start = jnp.ones_like(first)
     importance = balance(atmosphere, tables, rays, panels)
     everywhere = jnp.ones_like(rays.ground)
+    parts = np.arange(PARTS if apart else 1)[:, None]
 
     def step(state: State) -> State:
         stream = state.stream
@@ -263,7 +273,9 @@ def trace(
         to_sun = columns.to_top(atmosphere, altitude, mu_s, lattice.independent(stream, 2, dtype), panels)
         once = air * phase.rayleigh(nu) + dust * phase.mie(nu, atmosphere.mie_g, atmosphere.mie_phase)
         once = jnp.where(on_ground, albedo * jnp.maximum(mu_s, 0) / jnp.pi, once)
-        total = state.total + weight * once * to_sun * solar
+        vertex = jnp.where(fresh, 0, state.vertex)
+        part = jnp.where((vertex == 0) & on_ground, PARTS - 1, jnp.minimum(vertex, PARTS - 2)) if apart else 0 * vertex
+        total = state.total + (part == parts)[:, None] * (weight * once * to_sun * solar)
 
         by_air, by_dust = (jnp.sum(importance * weight * part, axis=0) for part in (air, dust))
         share = safe_divide(by_dust, by_air + by_dust)
@@ -278,9 +290,9 @@ def trace(
         dimension = jnp.where(goes_on, lattice.advance(stream.dimension, 5 if hemisphere else 3), start)
         index = jnp.where(goes_on | ~working, stream.index, stream.index + stride)
         total = jnp.where(working, total, state.total)
-        return State(altitude, up, direction, weight, Stream(stream.key, index, dimension), total)
+        return State(altitude, up, direction, weight, vertex + 1, Stream(stream.key, index, dimension), total)
 
-    nothing = jnp.zeros((wavelengths, first.size), dtype)
+    nothing = jnp.zeros((parts.size, wavelengths, first.size), dtype)
     stream = Stream(key, first, start)
-    state = State(rays.altitude, rays.up, rays.view, nothing, stream, nothing)
+    state = State(rays.altitude, rays.up, rays.view, nothing[0], 0 * first, stream, nothing)
     return jax.lax.while_loop(lambda state: jnp.any(state.stream.index < count), step, state).total
