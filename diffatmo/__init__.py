@@ -79,6 +79,7 @@ __all__ = [
     "atmosphere",
     "camera",
     "color",
+    "comparison",
     "compiler_options",
     "constants",
     "earth",

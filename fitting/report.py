@@ -131,7 +131,7 @@ def write(
         tasks[f"fitted_{name}.exr"] = exr(fitted, scene_of(result, observation))
         tasks[f"fitted_{name}.png"] = png(developed(observation, fitted, wavelengths)[1])
         tasks[f"residual_{name}.exr"] = exr(residual, None)
-        tasks[f"residual_{name}.png"] = png(_diverging(np.mean(residual, axis=-1), scale))
+        tasks[f"residual_{name}.png"] = png(diverging(np.mean(residual, axis=-1), scale))
     tasks["report.html"] = text(lambda: page(result))
     failures = []
     for file, task in tasks.items():
@@ -386,7 +386,8 @@ def residual_scale(residuals: Sequence[Image]) -> float:
     return max(float(np.percentile(values, 99)), 1e-6) if values.size else 1.0
 
 
-def _diverging(values: Float[np.ndarray, "height width"], scale: float) -> Float[np.ndarray, "height width 3"]:
+def diverging(values: Float[np.ndarray, "height width"], scale: float) -> Float[np.ndarray, "height width 3"]:
+    """Blue to red over ±``scale``, white at 0, grey where there is no number."""
     colours = matplotlib.colormaps["RdBu_r"](Normalize(-scale, scale)(np.nan_to_num(values)))
     return np.where(np.isfinite(values)[..., None], colours[..., :3], _MASKED)
 
@@ -397,7 +398,8 @@ def _embed(figure: Figure) -> str:
     return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
 
 
-def _bare(axes: Axes, title: str) -> None:
+def bare(axes: Axes, title: str) -> None:
+    """A panel for a picture: a title, no ticks."""
     axes.set_title(title, fontsize=9)
     axes.set_xticks([])
     axes.set_yticks([])
@@ -417,12 +419,12 @@ def image_figure(
     pictures = developed(observation, fitted, wavelengths)
     for axes, picture, title in zip(above.subplots(1, 2), pictures, ("measured", "fitted"), strict=True):
         axes.imshow(picture, interpolation="nearest")
-        _bare(axes, title)
+        bare(axes, title)
     panels = np.atleast_1d(below.subplots(1, len(channels)))
     norm = Normalize(-100 * scale, 100 * scale)
     for axes, (title, values) in zip(panels, channels.items(), strict=True):
-        axes.imshow(_diverging(values, scale), interpolation="nearest")
-        _bare(axes, title)
+        axes.imshow(diverging(values, scale), interpolation="nearest")
+        bare(axes, title)
     bar = below.colorbar(ScalarMappable(norm, "RdBu_r"), ax=list(panels), shrink=0.8, pad=0.01)
     bar.set_label("residual, %", fontsize=8)
     bar.ax.tick_params(labelsize=8)
@@ -489,7 +491,7 @@ def histogram_figure(result: FitResult) -> Figure:
 
 # The page -----------------------------------------------------------------------------------------------------------
 
-_STYLE = """
+STYLE = """
 :root { color-scheme: light; --ink: #1c2430; --soft: #5b6675; --line: #dde2e8; --good: #1b7f4b; --bad: #b3361b; }
 body { font: 15px/1.5 system-ui, sans-serif; color: var(--ink); max-width: 62rem; margin: 2rem auto; padding: 0 1rem; }
 h1 { font-size: 1.5rem; margin-bottom: .2rem; } h2 { font-size: 1.1rem; margin-top: 2.2rem; }
@@ -507,7 +509,7 @@ def page(result: FitResult) -> str:
     wavelengths = [float(nm) for nm in result.atmosphere.wavelengths]
     scale = residual_scale(result.residuals)
     images = [
-        _figure(image_figure(o, fitted, residual, wavelengths, scale), _caption(o, _image_record(result, number)))
+        figure_tag(image_figure(o, fitted, residual, wavelengths, scale), _caption(o, _image_record(result, number)))
         for number, (o, fitted, residual) in enumerate(
             zip(result.observations, result.fitted, result.residuals, strict=True)
         )
@@ -515,7 +517,7 @@ def page(result: FitResult) -> str:
     seconds = ", ".join(f"{key.removesuffix('_s')} {value:.1f} s" for key, value in result.timings.items())
     parts = [
         "<!doctype html><html lang=en><meta charset=utf-8><meta name=viewport content='width=device-width'>",
-        f"<title>diffatmo fit</title><style>{_STYLE}</style>",
+        f"<title>diffatmo fit</title><style>{STYLE}</style>",
         "<h1>Which atmosphere made this sky?</h1>",
         f"<p class={'good' if result.converged else 'bad'}><strong>{_verdict(result)}.</strong></p>",
         f"<p class=soft>{html.escape(result.message)}. Time: {seconds}.</p>",
@@ -525,20 +527,21 @@ def page(result: FitResult) -> str:
         "<h2>Images</h2>",
         *images,
         "<h2>Fit</h2><div class=pair>",
-        _figure(
+        figure_tag(
             convergence_figure(result),
             "Convergence. Lines part the passes: sigma from the measured signal, from the fitted one, and, where the model "
             "has one, the finer model. Each changes χ² a little.",
         ),
-        _figure(histogram_figure(result), "Residuals in units of their standard deviation."),
+        figure_tag(histogram_figure(result), "Residuals in units of their standard deviation."),
         "</div>",
-        _figure(correlation_figure(result), "Correlation of the fitted numbers."),
+        figure_tag(correlation_figure(result), "Correlation of the fitted numbers."),
         "</html>",
     ]
     return "\n".join(parts)
 
 
-def _figure(figure: Figure, caption: str) -> str:
+def figure_tag(figure: Figure, caption: str) -> str:
+    """A figure as HTML that needs no other file."""
     return f"<figure><img src='{_embed(figure)}' alt=''><figcaption>{html.escape(caption)}</figcaption></figure>"
 
 

@@ -25,7 +25,10 @@ LEVELS = [
     ["diffatmo.scattering"],
     ["diffatmo.models.base", "diffatmo.models.tables"],
     ["diffatmo.models.transmittance_table"],
-    [f"diffatmo.models.{name}" for name in ("moments.angular", "pathtrace.columns", "pathtrace.lattice")],
+    [
+        f"diffatmo.models.{name}"
+        for name in ("moments.angular", "pathtrace.columns", "pathtrace.lattice", "pathtrace.slab")
+    ],
     ["diffatmo.models.moments.shell", "diffatmo.models.pathtrace.vector", "diffatmo.models.pathtrace.guide"],
     ["diffatmo.models.moments.solve", "diffatmo.models.pathtrace.paths", "diffatmo.models.bruneton.precomputation"],
     ["diffatmo.models.hillaire.luts"],
@@ -33,7 +36,7 @@ LEVELS = [
     [f"diffatmo.models.{name}" for name in ("raymarch", "moments", "bruneton", "hillaire", "pathtrace")],
     ["diffatmo.models"],
     ["diffatmo.render", "diffatmo.imageio"],
-    ["diffatmo.scene"],
+    ["diffatmo.scene", "diffatmo.comparison"],
     ["fitting._errors"],
     ["fitting.parameters", "fitting.observation"],
     ["fitting.residuals"],
@@ -47,6 +50,7 @@ LEVELS = [
     ["diffatmo.cli.scenefile"],
     ["diffatmo.cli.images"],
     ["diffatmo.cli.radiance", "diffatmo.cli.render", "diffatmo.cli.fit"],
+    ["diffatmo.cli.compare"],
     ["diffatmo.cli.main"],
     ["diffatmo.__main__"],
 ]

@@ -1,6 +1,7 @@
 """What the subcommands share: their error, the choice of a model, and the checks of what they read and write."""
 
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -71,6 +72,18 @@ def check_writable(directory: Path) -> None:
             pass
     except OSError as error:
         raise InputError(f"{directory}: cannot be written to: {error.strerror}") from error
+
+
+def check_folder(directory: Path, *, present: Sequence[str], prefixes: Sequence[str] = (), overwrite: bool) -> None:
+    """Create ``directory`` if need be; refuse one that holds results of these names already, or cannot be written to."""
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{directory}: cannot be written to: {error.strerror}") from error
+    check_writable(directory)
+    taken = sorted(f.name for f in directory.iterdir() if f.name in present or f.name.startswith(tuple(prefixes)))
+    if taken and not overwrite:
+        raise InputError(f"{directory}: holds results already ({taken[0]}); give --overwrite to replace them")
 
 
 def make_model(name: str, *, samples: int | None = None, seed: int | None = None) -> "Model":

@@ -11,6 +11,7 @@ import click
 
 from diffatmo import __version__
 from diffatmo.cli import cache
+from diffatmo.cli.compare import compare
 from diffatmo.cli.fit import fit
 from diffatmo.cli.radiance import radiance
 from diffatmo.cli.render import render
@@ -38,6 +39,7 @@ def diffatmo(context: click.Context) -> None:
 diffatmo.add_command(radiance)
 diffatmo.add_command(render)
 diffatmo.add_command(fit)
+diffatmo.add_command(compare)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -1,0 +1,104 @@
+"""Models held against each other: the statistics, and the command."""
+
+import json
+
+import numpy as np
+import pytest
+
+import diffatmo
+from diffatmo import comparison, scene, sun
+from diffatmo.cli.main import main
+from diffatmo.comparison import Outcome
+
+
+@pytest.fixture
+def place():
+    camera = diffatmo.Equirectangular(16, 32)
+    return diffatmo.Scene(diffatmo.earth(), camera, 0.1, sun.direction(zenith=1.0, azimuth=0.0))
+
+
+def outcome(picture, stderr=None):
+    return Outcome(picture, stderr, 0.0, 0.0, 0.0)
+
+
+def test_a_known_difference_is_found(place):
+    """One percent more in the sky and two percent less on the ground, at every wavelength."""
+    truth = np.ones((16, 32, 3))
+    seen = np.where(np.arange(16)[:, None, None] < 8, 1.01, 0.98) * truth
+    found = comparison.errors(place, outcome(seen), outcome(truth))
+    assert found.rms == pytest.approx(0.01, abs=1e-6)
+    assert found.mean == pytest.approx(0.01, abs=1e-6)
+    assert found.largest == pytest.approx(0.01, abs=1e-6)
+    assert found.ground == pytest.approx(0.02, abs=1e-6)
+    assert found.noise == 0
+
+
+def test_pixels_count_by_their_solid_angle(place):
+    """An error in the row at the zenith weighs 1 - cos(11.25°) of the sky; at 2:1 the rows are 11.25° high."""
+    truth = np.ones((16, 32, 3))
+    seen = truth.copy()
+    seen[0] = 2
+    found = comparison.errors(place, outcome(seen), outcome(truth))
+    sky = comparison.regions(place)["sky"]
+    kept = np.asarray(place.camera.solid_angles())[sky].sum() / (2 * np.pi)
+    assert found.mean == pytest.approx((1 - np.cos(np.radians(11.25))) / kept, rel=1e-5)
+
+
+def test_noise_of_both_pictures_adds(place):
+    truth = np.full((16, 32, 3), 2.0)
+    noisy = outcome(truth, np.full_like(truth, 0.02))
+    found = comparison.errors(place, noisy, outcome(truth, np.full_like(truth, 0.04)))
+    assert found.noise == pytest.approx(np.hypot(0.01, 0.02))
+    assert comparison.errors(place, noisy, noisy).noise == pytest.approx(0.01)
+
+
+def test_the_dark_is_left_out(place):
+    """Below 1e-5 of the brightest a relative error says nothing; where all is dark there is no error."""
+    truth = np.zeros((16, 32, 3))
+    truth[:8] = 1
+    found = comparison.errors(place, outcome(truth + 1e-7), outcome(truth))
+    assert np.isnan(found.ground)
+    assert found.rms < 1e-6
+
+
+def test_the_sun_and_the_horizon(place):
+    """The sky ends at the geometric horizon, 0.32° down from 100 m, and has a hole of 3° around the sun."""
+    masks = comparison.regions(place)
+    view = np.asarray(place.camera.directions())
+    assert not (masks["sky"] & masks["ground"]).any()
+    assert (view[masks["ground"]][:, 2] < 0).all()
+    assert (view[masks["sky"]] @ np.asarray(place.sun)).max() < np.cos(np.radians(3))
+    assert masks["horizon"].sum() < masks["sky"].sum()
+
+
+def test_the_command(tmp_path, capsys):
+    """Single scattering misses a third of the light; everything that was computed is in the folder."""
+    folder = tmp_path / "out"
+    assert main(["compare", "earth", "-o", str(folder), "--models", "raymarch", "--width", "24"]) == 0
+    assert "raymarch" in capsys.readouterr().out
+    record = json.loads((folder / "compare.json").read_text())
+    assert record["truth"] == "moments"
+    assert record["models"]["moments"]["rms"] == 0
+    assert -0.5 < record["models"]["raymarch"]["mean"] < -0.1
+    picture, truth = (scene.load(folder / f"picture_{name}.exr") for name in ("raymarch", "moments"))
+    error = scene.load(folder / "error_raymarch.exr")
+    assert error.notes == {"model": "raymarch", "relative_to": "moments"}
+    # Single precision in the files.
+    np.testing.assert_allclose(error.pixels, picture.pixels / truth.pixels - 1, atol=1e-6)
+    assert (folder / "compare.html").read_text().count("<img") == 1
+    assert main(["compare", "earth", "-o", str(folder)]) == 2
+    assert "--overwrite" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["--models", "blender"], "--models"),
+        (["--truth", "raymarch"], "--truth"),
+        (["--width", "0"], "--width"),
+        (["--projection", "pinhole", "--upper"], "upper"),
+    ],
+)
+def test_bad_input(arguments, named, tmp_path, capsys):
+    assert main(["compare", "earth", "-o", str(tmp_path / "out"), *arguments]) == 2
+    assert named in capsys.readouterr().err
