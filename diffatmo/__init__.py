@@ -83,6 +83,7 @@ __all__ = [
     "compiler_options",
     "constants",
     "earth",
+    "export",
     "geometry",
     "imageio",
     "load",

@@ -277,13 +277,15 @@ def write_exr(
     metadata: Mapping[str, Attribute] | None = None,
     *,
     wavelengths: Sequence[float] | np.ndarray | None = None,
+    half: bool = False,
     overwrite: bool = False,
 ) -> None:
-    """Write linear pixels as 32-bit EXR, with texts and numbers in the header.
+    """Write linear pixels as EXR of 32 bits a channel, or 16 (``half``), with texts and numbers in the header.
 
-    One channel is written as Y, three as R, G, B (with ``wavelengths``: red is the longest), any other number under the
-    names of the spectral layout of Fichet et al. 2021. :func:`read_image` gives the same array back, in the same order.
-    Numbers in the header have single precision; what must be exact goes in as text.
+    One channel is written as Y, three as R, G, B (with ``wavelengths``: red is the longest), four without wavelengths as
+    R, G, B, A, any other number under the names of the spectral layout of Fichet et al. 2021. :func:`read_image` gives the
+    same array back, in the same order, but for the fourth of R, G, B, A. Numbers in the header have single precision; what
+    must be exact goes in as text.
     """
     planes = np.asarray(pixels, dtype=np.float32)
     if planes.ndim != 3 or 0 in planes.shape:
@@ -291,10 +293,10 @@ def write_exr(
     count = planes.shape[-1]
     if wavelengths is not None and len(wavelengths) != count:
         raise ImageError(f"{path}: {len(wavelengths)} wavelengths for {count} channels")
-    if wavelengths is None and count not in (1, 3):
-        raise ImageError(f"{path}: {count} channels without wavelengths, expected 1 or 3, or their wavelengths")
+    if wavelengths is None and count not in (1, 3, 4):
+        raise ImageError(f"{path}: {count} channels without wavelengths, expected 1, 3 or 4, or their wavelengths")
     header: dict[str, object] = dict(metadata or {})
-    names = ["Y"] if count == 1 else ["R", "G", "B"]
+    names = ["Y"] if count == 1 else ["R", "G", "B", "A"][:count]
     if wavelengths is not None:
         texts = [str(item) for item in np.asarray(wavelengths)]
         header[WAVELENGTHS] = " ".join(texts)
@@ -303,7 +305,8 @@ def write_exr(
         elif count > 1:
             names = [_spectral_name(float(text)) for text in texts]
     header |= {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    channels = {name: np.ascontiguousarray(planes[..., i]) for i, name in enumerate(names)}
+    stored = planes.astype(np.float16) if half else planes
+    channels = {name: np.ascontiguousarray(stored[..., i]) for i, name in enumerate(names)}
     if len(channels) != count:
         raise ImageError(f"{path}: two channels have the same wavelength")
     with atomic_write(path, overwrite=overwrite) as temporary, _quiet():

@@ -36,7 +36,7 @@ LEVELS = [
     [f"diffatmo.models.{name}" for name in ("raymarch", "moments", "bruneton", "hillaire", "pathtrace")],
     ["diffatmo.models"],
     ["diffatmo.render", "diffatmo.imageio"],
-    ["diffatmo.scene", "diffatmo.comparison"],
+    ["diffatmo.scene", "diffatmo.comparison", "diffatmo.export"],
     ["fitting._errors"],
     ["fitting.parameters", "fitting.observation"],
     ["fitting.residuals"],
@@ -50,7 +50,7 @@ LEVELS = [
     ["diffatmo.cli.scenefile"],
     ["diffatmo.cli.images"],
     ["diffatmo.cli.radiance", "diffatmo.cli.render", "diffatmo.cli.fit"],
-    ["diffatmo.cli.compare"],
+    ["diffatmo.cli.compare", "diffatmo.cli.export"],
     ["diffatmo.cli.main"],
     ["diffatmo.__main__"],
 ]

@@ -12,6 +12,7 @@ import click
 from diffatmo import __version__
 from diffatmo.cli import cache
 from diffatmo.cli.compare import compare
+from diffatmo.cli.export import export
 from diffatmo.cli.fit import fit
 from diffatmo.cli.radiance import radiance
 from diffatmo.cli.render import render
@@ -40,6 +41,7 @@ diffatmo.add_command(radiance)
 diffatmo.add_command(render)
 diffatmo.add_command(fit)
 diffatmo.add_command(compare)
+diffatmo.add_command(export)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

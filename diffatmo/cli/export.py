@@ -1,0 +1,175 @@
+"""``diffatmo export``: the tables of Bruneton or Hillaire, for a renderer."""
+
+import math
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from diffatmo.cli import keys
+from diffatmo.cli.common import InputError, check_folder, overwrite_option, read_atmosphere
+from diffatmo.cli.keys import CAMERA_KEYS, PLACE_KEYS, Number
+from diffatmo.cli.render import DEFAULTS, SIZE, picture_size
+
+if TYPE_CHECKING:
+    from diffatmo.atmosphere import Atmosphere
+    from diffatmo.export import Texture
+
+LUTS = ("bruneton", "hillaire")
+PARAMETERISATIONS = ("2017", "2008")
+FOLDERS = ("float", "half", "README.md")
+VOLUME_KEYS = {"reach_km": Number("How far the aerial perspective reaches.", 0, positive=True)}
+VIEWED = DEFAULTS | {"projection": "pinhole", "reach_km": 32.0}
+DEFAULT_WIDTH = 960
+DEFAULT_ORDERS = 4
+PHASES = {
+    "henyey-greenstein": "1 / (4 π) (1 - g²) / (1 + g² - 2 g nu)^(3/2)",
+    "cornette-shanks": "3 / (8 π) (1 - g²) (1 + nu²) / ((2 + g²) (1 + g² - 2 g nu)^(3/2))",
+}
+
+
+@click.command()
+@click.argument("atmosphere", metavar="ATM.toml")
+@click.option("--luts", type=click.Choice(LUTS), required=True, help="Whose tables.")
+@click.option("-o", "--output", metavar="DIR", type=click.Path(path_type=Path), required=True, help="Folder to write.")
+@click.option(
+    "--parameterisation",
+    type=click.Choice(PARAMETERISATIONS),
+    help="bruneton: where the entries of its tables are.  [default: 2017]",
+)
+@click.option("--orders", type=click.IntRange(min=1), help="bruneton: orders of scattering.  [default: 4]")
+@click.option("--width", type=SIZE, help="hillaire: pixels across of the camera's picture.  [default: 960]")
+@click.option("--height", type=SIZE, help="hillaire: pixels down.  [default: by the projection]")
+@keys.options(VOLUME_KEYS, VIEWED)
+@keys.options(CAMERA_KEYS, VIEWED)
+@keys.options(PLACE_KEYS, VIEWED)
+@overwrite_option
+def export(
+    atmosphere: str,
+    luts: str,
+    output: Path,
+    parameterisation: str | None,
+    orders: int | None,
+    width: int | None,
+    height: int | None,
+    overwrite: bool,
+    **values: Any,
+) -> None:
+    """Write the tables of a model as textures.
+
+    ATM.toml is an atmosphere file or the name of a preset. DIR receives every table as EXR, in single and in half precision,
+    each with its parameterisation, its unit and what it omits in the header, and a README that says how to sample them. The
+    sun, the camera and the altitude matter to hillaire only, whose last three tables belong to one place.
+    """
+    of_place = keys.given(VOLUME_KEYS | CAMERA_KEYS | PLACE_KEYS, values)
+    of_camera = of_place | {k: v for k, v in {"width": width, "height": height}.items() if v is not None}
+    of_tables = {k: v for k, v in {"parameterisation": parameterisation, "orders": orders}.items() if v is not None}
+    for name in of_camera if luts == "bruneton" else of_tables:
+        raise InputError(f"{keys.flag_of(name)} contradicts --luts {luts}: it belongs to the other one")
+    options = VIEWED | of_place
+    keys.check_camera_options(options)
+    check_folder(output, present=FOLDERS, overwrite=overwrite)
+    from rich.console import Console
+    from rich.table import Table
+
+    from diffatmo import export as tables
+    from diffatmo import imageio
+
+    air = read_atmosphere(atmosphere)
+    console = Console(width=None if Console().is_terminal else 120)
+    with console.status("computing the tables …"):
+        if luts == "bruneton":
+            textures, kind, facts = _bruneton(air, parameterisation or PARAMETERISATIONS[0], orders or DEFAULT_ORDERS)
+        else:
+            textures, kind, facts = _hillaire(air, options, width or DEFAULT_WIDTH, height)
+        written = tables.write(textures, output, air, kind, overwrite=True)
+    shown = Table("table", "size", "largest entry", "error of half")
+    for texture in textures:
+        error = f"{100 * tables.half_error(texture.texels):.2g} %"
+        shown.add_row(texture.name, _size(texture), f"{texture.texels.max():.4g}", error)
+    with imageio.atomic_write(output / "README.md", overwrite=True) as path:
+        path.write_text(_readme(luts, textures, facts), encoding="utf-8")
+    console.print(shown)
+    console.print(f"{len(written)} pictures; how to sample them: {output / 'README.md'}", soft_wrap=True)
+
+
+def _bruneton(air: "Atmosphere", parameterisation: str, orders: int) -> "tuple[list[Texture], str, dict[str, Any]]":
+    from diffatmo import export as tables
+    from diffatmo.models import Bruneton
+
+    model = Bruneton(parameterisation=parameterisation, orders=orders)
+    sizes = model.sizes
+    facts = {
+        "maps": _text(f"maps_{parameterisation}"),
+        "parameterisation": parameterisation,
+        "bottom": f"{float(air.bottom_radius):g}",
+        "top": f"{float(air.top_radius):g}",
+        "phase": PHASES[air.mie_phase],
+        "g": f"{float(air.mie_g):g}",
+        "mu_s_min": f"{model.mu_s_min:g}",
+        "t_mu": sizes.transmittance_mu,
+        "t_r": sizes.transmittance_r,
+        "e_mu_s": sizes.irradiance_mu_s,
+        "e_r": sizes.irradiance_r,
+        "r": sizes.r,
+        "mu": sizes.mu,
+        "mu_s": sizes.mu_s,
+        "nu": sizes.nu,
+    }
+    return tables.bruneton(air, model), f"Bruneton & Neyret 2008, maps of {parameterisation}", facts
+
+
+def _hillaire(
+    air: "Atmosphere", options: dict[str, Any], width: int, height: int | None
+) -> "tuple[list[Texture], str, dict[str, Any]]":
+    from diffatmo import camera as cameras
+    from diffatmo import export as tables
+    from diffatmo import sun
+    from diffatmo.models import Hillaire
+
+    model = Hillaire()
+    columns, rows = picture_size(options, width, height)
+    camera = keys.make_camera({k: v for k, v in options.items() if k in CAMERA_KEYS}, height=rows, width=columns)
+    towards = sun.direction(
+        zenith=math.radians(options["sun_zenith_deg"]), azimuth=math.radians(options["sun_azimuth_deg"])
+    )
+    reach = float(options["reach_km"])
+    textures = tables.hillaire(
+        air, model, altitude=options["altitude_km"], sun=towards, camera=camera, reach=reach
+    )  # fmt: skip
+    facts = {
+        "bottom": f"{float(air.bottom_radius):g}",
+        "top": f"{float(air.top_radius):g}",
+        "altitude": f"{options['altitude_km']:g}",
+        "sun_zenith": f"{options['sun_zenith_deg']:g}",
+        "camera": ", ".join(f"{key} {value}" for key, value in cameras.to_dict(camera).items()),
+        "t_mu": model.transmittance_size[0],
+        "t_r": model.transmittance_size[1],
+        "m_mu_s": model.multiple_size[0],
+        "m_h": model.multiple_size[1],
+        "s_u": model.sky_view_size[0],
+        "s_v": model.sky_view_size[1],
+        "s_half": model.sky_view_size[1] // 2,
+        "slices": textures[-1].texels.shape[0],
+        "reach": f"{reach:g}",
+    }
+    return textures, "Hillaire 2020; transmittance as Bruneton 2017", facts
+
+
+def _size(texture: "Texture") -> str:
+    depth, height, width, _ = texture.texels.shape
+    return f"{width}×{height}" + (f"×{depth}" if depth > 1 else "")
+
+
+def _text(name: str) -> str:
+    return files("diffatmo").joinpath("data", "export", f"{name}.md").read_text(encoding="utf-8").rstrip("\n")
+
+
+def _readme(luts: str, textures: "list[Texture]", facts: dict[str, Any]) -> str:
+    text = _text(luts)
+    rows = (f"| `{t.name}` | {_size(t)} | {t.axes} | {t.unit} | {t.omits} |" for t in textures)
+    # The maps first: they have names of their own.
+    for name, value in {"tables": "\n".join(rows), **facts}.items():
+        text = text.replace(f"@{name}@", str(value))
+    return text + "\n"
