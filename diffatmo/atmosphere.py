@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from diffatmo import constants, spectrum
 from diffatmo._types import Altitude, Scalar, Spectrum
-from diffatmo.phase import MIE_PHASES
+from diffatmo.phase import MIE_PHASES, PhaseTable, Shape
 
 
 class AtmosphereError(ValueError):
@@ -74,7 +74,8 @@ class Atmosphere(eqx.Module):
     """All parameters of a planet's sky, at ``w`` wavelengths.
 
     Lengths are km, coefficients km^-1 at the ground (ozone: at its peak), wavelengths nm. Every leaf is an array and may
-    be differentiated; ``mie_phase`` is static. Raises :class:`AtmosphereError` for a value outside its range.
+    be differentiated; ``mie_phase`` is static: a name, or a :class:`~diffatmo.phase.PhaseTable`, to which ``mie_g`` means
+    nothing. Raises :class:`AtmosphereError` for a value outside its range.
     """
 
     wavelengths: Spectrum = eqx.field(converter=_array)
@@ -91,7 +92,7 @@ class Atmosphere(eqx.Module):
     ground_albedo: Spectrum = eqx.field(converter=_array)
     ozone_center_altitude: Scalar = eqx.field(converter=_array, default=25.0)
     ozone_half_width: Scalar = eqx.field(converter=_array, default=15.0)
-    mie_phase: str = eqx.field(static=True, default="henyey-greenstein")
+    mie_phase: Shape = eqx.field(static=True, default="henyey-greenstein")
 
     def __check_init__(self) -> None:
         check(self)
@@ -148,6 +149,9 @@ _UNITS = {
 FILE_KEYS = {field.name: field.name + _UNITS.get(field.name, "") for field in fields(Atmosphere)}
 """Field of :class:`Atmosphere` -> key of the TOML file (the unit is in the key)."""
 
+TABULATED, ANGLES, VALUES = "tabulated", "mie_phase_angles_deg", "mie_phase_values"
+"""How a file names a table of the aerosol's phase function, and its two keys."""
+
 SPECTRAL = (
     "wavelengths",
     "solar_irradiance",
@@ -170,14 +174,17 @@ _NOT_NEGATIVE = (
 )
 
 
+_PHASE_NAMES = " or ".join(repr(name) for name in (*MIE_PHASES, TABULATED))
+
+
 def _refuse(key: str, value: Any, expected: str) -> None:
     raise AtmosphereError(f"{FILE_KEYS.get(key, key)}: got {value}, expected {expected}")
 
 
 def check(atmosphere: Atmosphere) -> None:
     """Raise :class:`AtmosphereError` unless every concrete value is in its range (traced values are not looked at)."""
-    if atmosphere.mie_phase not in MIE_PHASES:
-        _refuse("mie_phase", repr(atmosphere.mie_phase), " or ".join(repr(name) for name in MIE_PHASES))
+    if not isinstance(atmosphere.mie_phase, PhaseTable) and atmosphere.mie_phase not in MIE_PHASES:
+        _refuse("mie_phase", repr(atmosphere.mie_phase), _PHASE_NAMES)
     values: dict[str, np.ndarray] = {}
     count: int | None = None
     for name in FILE_KEYS:
@@ -223,10 +230,11 @@ def from_dict(data: Mapping[str, Any]) -> Atmosphere:
     Raises :class:`AtmosphereError` naming the key for anything missing, unknown, of the wrong type or out of range.
     """
     by_key = {key: name for name, key in FILE_KEYS.items()}
+    data, table = _take_table(data)
     unknown = sorted(set(data) - set(by_key))
     if unknown:
         raise AtmosphereError(f"{unknown[0]}: unknown key; an atmosphere has the keys {', '.join(by_key)}")
-    optional = ("ozone_center_altitude", "ozone_half_width", "mie_phase")
+    optional = ("ozone_center_altitude", "ozone_half_width", "mie_phase", *["mie_g"] * (table is not None))
     missing = [key for key, name in by_key.items() if key not in data and name not in optional]
     if missing:
         raise AtmosphereError(f"{missing[0]}: missing; an atmosphere needs {', '.join(missing)}")
@@ -235,7 +243,7 @@ def from_dict(data: Mapping[str, Any]) -> Atmosphere:
         name = by_key[key]
         if name == "mie_phase":
             if not isinstance(value, str):
-                _refuse(name, repr(value), "a name: " + " or ".join(MIE_PHASES))
+                _refuse(name, repr(value), f"a name: {_PHASE_NAMES}")
             values[name] = value
         elif name in SPECTRAL:
             if not isinstance(value, list) or not value:
@@ -243,7 +251,31 @@ def from_dict(data: Mapping[str, Any]) -> Atmosphere:
             values[name] = [_number(key, item) for item in value]
         else:
             values[name] = _number(key, value)
+    if table is not None:
+        values = {"mie_g": table.asymmetry} | values | {"mie_phase": table}
     return Atmosphere(**values)
+
+
+def _take_table(data: Mapping[str, Any]) -> tuple[dict[str, Any], PhaseTable | None]:
+    """Split the table of the aerosol's phase function, if the file has one, from the other keys."""
+    rest = {key: value for key, value in data.items() if key not in (ANGLES, VALUES)}
+    if data.get("mie_phase") != TABULATED:
+        if len(rest) < len(data):
+            raise AtmosphereError(f"{ANGLES}, {VALUES}: given, but mie_phase is not {TABULATED!r}")
+        return rest, None
+    columns = []
+    for key in (ANGLES, VALUES):
+        if not isinstance(data.get(key), list):
+            raise AtmosphereError(
+                f"{key}: got {data.get(key)!r}, expected a list of numbers, as mie_phase is {TABULATED!r}"
+            )
+        columns.append([_number(key, item) for item in data[key]])
+    try:
+        table = PhaseTable(*columns)
+    except ValueError as error:
+        raise AtmosphereError(f"{ANGLES}, {VALUES}: {error}") from error
+    del rest["mie_phase"]
+    return rest, table
 
 
 def _shortest(value: Any) -> float:
@@ -257,7 +289,9 @@ def to_dict(atmosphere: Atmosphere) -> dict[str, Any]:
     result: dict[str, Any] = {}
     for name, key in FILE_KEYS.items():
         value = getattr(atmosphere, name)
-        if isinstance(value, str):
+        if isinstance(value, PhaseTable):
+            result |= {key: TABULATED, ANGLES: list(value.angles_deg), VALUES: list(value.values)}
+        elif isinstance(value, str):
             result[key] = value
         else:
             array = np.asarray(value)

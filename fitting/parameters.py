@@ -31,6 +31,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from diffatmo.atmosphere import FILE_KEYS, SPECTRAL, Atmosphere
 from diffatmo.numerics import safe_divide
+from diffatmo.phase import PhaseTable
 from fitting._errors import FitError
 
 Coordinates = Float[Array, " n"]
@@ -325,6 +326,8 @@ def select(init: Atmosphere, free: Sequence[str], scaled: Sequence[str] = ()) ->
         raise FitError(f"free: {repeated[0]!r} is given twice")
     if {"bottom_radius", "top_radius"} <= set(free):
         raise FitError("free: bottom_radius and top_radius bound each other; free only one of them")
+    if "mie_g" in free and isinstance(init.mie_phase, PhaseTable):
+        raise FitError("free: 'mie_g' means nothing to an aerosol with a tabulated phase function")
     for name in scaled:
         if name not in free:
             raise FitError(f"scaled: {name!r} is not among the free parameters ({', '.join(free)})")

@@ -105,7 +105,7 @@ def _bruneton(air: "Atmosphere", parameterisation: str, orders: int) -> "tuple[l
         "parameterisation": parameterisation,
         "bottom": f"{float(air.bottom_radius):g}",
         "top": f"{float(air.top_radius):g}",
-        "phase": PHASES[air.mie_phase],
+        "phase": PHASES[air.mie_phase] if isinstance(air.mie_phase, str) else "the table of the atmosphere file",
         "g": f"{float(air.mie_g):g}",
         "mu_s_min": f"{model.mu_s_min:g}",
         "t_mu": sizes.transmittance_mu,

@@ -146,6 +146,7 @@ def run(job: Job, directory: Path, *, overwrite: bool) -> bool:
     from rich.console import Console
 
     import fitting
+    from diffatmo.models import Bruneton
     from fitting import report
 
     console = Console(width=None if sys.stdout.isatty() else PLAIN_WIDTH, highlight=False)
@@ -167,7 +168,7 @@ def run(job: Job, directory: Path, *, overwrite: bool) -> bool:
             init=job.init,
             free=job.free,
             scaled=job.scaled,
-            model=make_model(job.model),
+            model=Bruneton.reduced() if job.model == "bruneton" else make_model(job.model),
             progress=show,
             max_steps=job.max_steps,
             refine=job.refine,

@@ -45,7 +45,7 @@ IMAGE_KEYS: dict[str, Key] = {
 }
 """The keys of an ``[[image]]``, each also an option of the command line."""
 
-MODELS = ("moments", "raymarch")
+MODELS = ("moments", "bruneton", "hillaire", "raymarch")
 """The models that have derivatives."""
 
 SCENE_KEYS = ("init", "free", "scaled", "model", "max_steps", "image")

@@ -5,7 +5,6 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from diffatmo import geometry, phase, rays, scattering, table, transmittance
@@ -34,19 +33,6 @@ class Resolution(NamedTuple):
     ground_rows: int
     columns: int
     fine_columns: int
-
-
-def aureole_phase(atmosphere: Atmosphere, nu: Cosine, order: int, degree: int) -> Float[Array, "..."]:
-    """Phase function of ``order`` aerosol scatterings in a row, less its moments up to ``degree``, sr^-1.
-
-    Henyey-Greenstein convolved n times with itself has the moments (g^l)^n, and is Henyey-Greenstein with g^n. The peak of
-    Cornette-Shanks is that of Henyey-Greenstein times 3 / (2 + g²).
-    """
-    g = atmosphere.mie_g**order
-    height = 1.0 if atmosphere.mie_phase == "henyey-greenstein" else (3 / (2 + atmosphere.mie_g**2)) ** order
-    kept = ((2 * np.arange(degree + 1) + 1) / (4 * np.pi)).astype(nu.dtype)
-    low = phase.legendre(degree, nu) @ (kept * phase.mie_moments(g, degree, "henyey-greenstein"))
-    return height * (phase.henyey_greenstein(nu, g) - low)
 
 
 class MomentsSky(Sky):
@@ -105,7 +91,8 @@ class MomentsSky(Sky):
     def aureole_phases(self, nu: Cosine) -> list[Float[Array, "..."]]:
         """Phase functions of repeated forward scattering beyond the kept moments, orders 2, 3, …"""
         degrees = (self.resolution.degrees.first, *[self.resolution.degrees.last] * (scattering.AUREOLE_ORDERS - 1))
-        return [aureole_phase(self.atmosphere, nu, order, degree) for order, degree in enumerate(degrees, start=2)]
+        g, name = self.atmosphere.mie_g, self.atmosphere.mie_phase
+        return [phase.repeated(nu, g, name, order, degree) for order, degree in enumerate(degrees, start=2)]
 
     def sun_irradiance(self, *, altitude: Altitude, mu_s: Cosine) -> Irradiance:
         """Direct irradiance of the sun on a horizontal plane."""

@@ -88,7 +88,7 @@ def _first_order(atmosphere: Atmosphere, shell: Shell, degree: int, peak_azimuth
     return State(_moments(r, by_order, degree), _irradiance(r, by_order[:, 0]))
 
 
-def _peak(mie_phase: str) -> Callable[..., Float[Array, "1 ..."]]:
+def _peak(mie_phase: phase.Shape) -> Callable[..., Float[Array, "1 ..."]]:
     """The aerosol's phase function with g, shape (1,), at every nu, normalised over the very nodes it is summed on.
 
     A peak between nodes loses no light.

@@ -136,7 +136,7 @@ def _turn(
     ``aerosol`` is the aerosol's share in the scattering. Returns the direction and, divided by its probability, the phase
     functions of air and aerosol and Lambert's cosine / π there.
     """
-    radius, g = atmosphere.bottom_radius, atmosphere.mie_g
+    radius, g, name = atmosphere.bottom_radius, atmosphere.mie_g, atmosphere.mie_phase
     peak = jnp.where(on_ground, 0, PEAK_SHARE * aerosol)
     guided = (1 - peak) * GUIDE_SHARE
     plain = 1 - peak - guided
@@ -150,7 +150,7 @@ def _turn(
     node = guide.cell(altitude, vector.cosine(up, sun), atmosphere.top_altitude)
     horizon = geometry.horizon_mu(altitude, radius)
     guide_mu, guide_azimuth = guide.sample_direction(tables, node, horizon, u_guide, v)
-    turned = jnp.where(by_peak, phase.sample_henyey_greenstein(u_peak, g), phase.sample_rayleigh(u_plain))
+    turned = jnp.where(by_peak, phase.sample_mie(u_peak, g, name), phase.sample_rayleigh(u_plain))
     turned = jnp.where(by_guide, guide_mu, jnp.where(on_ground, jnp.sqrt(u_plain), jnp.clip(turned, -1, 1)))
     azimuth = jnp.where(by_guide, guide_azimuth, 2 * jnp.pi * v)
     new = vector.around(vector.where(on_ground | by_guide, up, direction), sun, turned, azimuth)
@@ -161,10 +161,10 @@ def _turn(
     air = phase.rayleigh(cos_turn)
     probability = (
         plain * jnp.where(on_ground, lambert, air)
-        + peak * phase.henyey_greenstein(cos_turn, g)
+        + peak * phase.sampled_density(cos_turn, g, name)
         + guided * guide.direction_density(tables, node, horizon, mu, cos_azimuth)
     )
-    dust = phase.mie(cos_turn, g, atmosphere.mie_phase)
+    dust = phase.mie(cos_turn, g, name)
     return new, (air / probability, dust / probability, lambert / probability)
 
 
