@@ -2,6 +2,7 @@
 
 import math
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -53,6 +54,11 @@ def air():
     )  # fmt: skip
 
 
+@eqx.filter_jit
+def seen(model, **rays):
+    return model.sky(air()).radiance(**rays).radiance
+
+
 def unit(zenith_deg, azimuth_deg):
     z, a = np.radians(zenith_deg), np.radians(azimuth_deg)
     return np.array([np.sin(z) * np.sin(a), np.sin(z) * np.cos(a), np.cos(z)])
@@ -63,8 +69,9 @@ def test_a_tutorial_s_numbers_come_out(x64, sun_zenith_deg):
     """The same sums in the same order of approximation: equal to rounding, above the horizon."""
     sun = unit(sun_zenith_deg, 30.0)
     views = np.stack([unit(z, a) for z in (0.0, 40.0, 75.0, 89.0) for a in (0.0, 100.0)])
-    sky = RayMarch(steps=64, light_steps=4).sky(air())
-    got = sky.radiance(altitude=jnp.asarray(1e-3), view=jnp.asarray(views), sun=jnp.asarray(sun)).radiance
+    got = seen(
+        RayMarch(steps=64, light_steps=4), altitude=jnp.asarray(1e-3), view=jnp.asarray(views), sun=jnp.asarray(sun)
+    )
     np.testing.assert_allclose(got, [tutorial(view, sun) for view in views], rtol=1e-9)
 
 
@@ -72,11 +79,8 @@ def test_many_naive_steps_approach_the_exact_integral(x64):
     """Their optical depth counts the whole step that a sample is the middle of: half the error for twice the steps."""
     views, sun = np.stack([unit(20.0, 0.0), unit(70.0, 120.0)]), unit(50.0, 0.0)
     given = {"altitude": jnp.asarray(0.1), "view": jnp.asarray(views), "sun": jnp.asarray(sun)}
-    exact = RayMarch(steps=24).sky(air()).radiance(**given).radiance
-    coarse, fine = (
-        np.abs(RayMarch(steps=n, light_steps=n).sky(air()).radiance(**given).radiance / exact - 1).max()
-        for n in (200, 400)
-    )
+    exact = seen(RayMarch(steps=24), **given)
+    coarse, fine = (np.abs(seen(RayMarch(steps=n, light_steps=n), **given) / exact - 1).max() for n in (200, 400))
     assert fine < 5e-3
     assert 0.4 < fine / coarse < 0.6
 

@@ -25,7 +25,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from diffatmo import geometry
-from diffatmo._types import Altitude, Cosine, Scalar
+from diffatmo._types import Altitude, Cosine, Length, Scalar
 from diffatmo.numerics import safe_divide, safe_sqrt
 
 PARAMETERISATIONS = ("2017", "2008")
@@ -78,6 +78,22 @@ class Planet(eqx.Module):
         radius = self.bottom_radius
         gap = (self.top_altitude - altitude) * (self.top_altitude + altitude + 2 * radius)
         return jnp.clip(safe_divide(gap - distance * distance, 2 * (radius + altitude) * distance, 1.0), -1, 1)
+
+    # Along a ray
+
+    def altitude_after(self, altitude: Altitude, mu: Cosine, distance: Length) -> Altitude:
+        """Altitude after ``distance`` km along a ray, kept inside the tables."""
+        return jnp.clip(geometry.altitude_along(altitude, mu, distance, self.bottom_radius), 0, self.top_altitude)
+
+    def cosine_after(
+        self, altitude: Altitude, cosine: Cosine, nu: Cosine | float, distance: Length, there: Altitude | float
+    ) -> Cosine:
+        """Cosine of a direction's zenith angle at altitude ``there``, after ``distance`` km along a ray.
+
+        ``cosine`` is that at the start and ``nu`` that of the angle to the ray: 1 for the direction of the ray itself.
+        """
+        radius = self.bottom_radius
+        return jnp.clip(((radius + altitude) * cosine + distance * nu) / (radius + there), -1, 1)
 
     # T(r, mu)
 

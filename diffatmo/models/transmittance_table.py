@@ -52,8 +52,7 @@ def between(
     ground: Bool[Array, "..."],
 ) -> Transmittance:
     """T over the first ``distance`` km of a ray."""
-    radius = planet.bottom_radius
-    there = jnp.clip(geometry.altitude_along(altitude, mu, distance, radius), 0, planet.top_altitude)
+    there = planet.altitude_after(altitude, mu, distance)
     return _ratio(planet, transmittance, altitude, mu, there, distance, ground)
 
 
@@ -77,8 +76,7 @@ def _ratio(
     ground: Bool[Array, "..."],
 ) -> Transmittance:
     """T between two points of a ray, as a ratio of two entries of the table (paper, eq. 6)."""
-    radius = planet.bottom_radius
-    mu_there = jnp.clip(((radius + altitude) * mu + distance) / (radius + there), -1, 1)
+    mu_there = planet.cosine_after(altitude, mu, 1.0, distance, there)
     sign = jnp.where(ground, -1.0, 1.0)
     here_up = to_top(planet, transmittance, altitude, sign * mu)
     there_up = to_top(planet, transmittance, there, sign * mu_there)

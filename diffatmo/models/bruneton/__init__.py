@@ -96,9 +96,9 @@ class BrunetonSky(Sky):
             whole = reach >= end
             part = between(planet, self.tables.transmittance, altitude, mu, reach, ground)
             survives = jnp.where(whole[..., None], survives, part)
-            there = jnp.clip(geometry.altitude_along(altitude, mu, reach, radius), 0, top)
-            mu_there = jnp.clip(((radius + altitude) * mu + reach) / (radius + there), -1, 1)
-            mu_s_there = jnp.clip(((radius + altitude) * mu_s + reach * nu) / (radius + there), -1, 1)
+            there = planet.altitude_after(altitude, mu, reach)
+            mu_there = planet.cosine_after(altitude, mu, 1.0, reach, there)
+            mu_s_there = planet.cosine_after(altitude, mu_s, nu, reach, there)
             beyond = self._scattered(there, mu_there, mu_s_there, nu, ground)
             air, aerosol = (
                 jnp.where(whole[..., None], all_of_it, jnp.maximum(all_of_it - part * rest, 0))

@@ -9,6 +9,8 @@ turns each of its harmonics into one of ΔJ. The paper samples it anew for every
 times as often.
 """
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -85,11 +87,10 @@ def _axes(planet: Planet, altitude: Scalar) -> _Axes:
 
 def _along(planet: Planet, axes: _Axes, distance: Float[Array, " m"]) -> tuple[Altitude, Cosine, Float[Array, "m v s"]]:
     """Altitude, mu and mu_s at a distance along the rays."""
-    radius = planet.bottom_radius
-    there = jnp.clip(geometry.altitude_along(axes.altitude, axes.mu, distance, radius), 0, planet.top_altitude)
-    r, r_there = radius + axes.altitude, radius + there
-    mu_s = (r * axes.mu_s + distance[:, None, None] * axes.nu) / r_there[:, None, None]
-    return there, jnp.clip((r * axes.mu + distance) / r_there, -1, 1), jnp.clip(mu_s, -1, 1)
+    there = planet.altitude_after(axes.altitude, axes.mu, distance)
+    mu = planet.cosine_after(axes.altitude, axes.mu, 1.0, distance, there)
+    far = distance[:, None, None], there[:, None, None]
+    return there, mu, planet.cosine_after(axes.altitude, axes.mu_s, axes.nu, *far)
 
 
 def compute_single_scattering(
@@ -135,24 +136,21 @@ def compute_single_scattering(
     return light * atmosphere.rayleigh_scattering * rayleigh, light * atmosphere.mie_scattering * mie
 
 
-def incident(
-    planet: Planet,
-    first: tuple[Scattered, Scattered] | None,
-    further: Scattered | None,
-    atmosphere: Atmosphere,
-    altitude: Altitude,
-    mu: Cosine,
-    mu_s: Cosine,
-    nu: Cosine,
-    ground: Bool[Array, "..."],
-) -> Float[Array, "... w"]:
-    """Light of one order of scattering from a direction: ΔS, or ΔS_R and ΔS_M with their phase functions."""
-    if further is not None:
-        return look_up(planet, further, altitude, mu, mu_s, nu, ground)
-    assert first is not None
-    air, aerosol = (look_up(planet, part, altitude, mu, mu_s, nu, ground) for part in first)
-    peak = phase.mie(nu, atmosphere.mie_g, atmosphere.mie_phase)
-    return phase.rayleigh(nu)[..., None] * air + peak[..., None] * aerosol
+Incident = Callable[[Altitude, Cosine, Cosine, Cosine, Bool[Array, "..."]], Float[Array, "... w"]]
+"""Light of one order of scattering from a direction: of (altitude, mu, mu_s, nu, whether the ray meets the ground)."""
+
+
+def of_first_order(atmosphere: Atmosphere, planet: Planet, rayleigh: Scattered, mie: Scattered) -> Incident:
+    """ΔS_R and ΔS_M with their phase functions."""
+
+    def light(
+        altitude: Altitude, mu: Cosine, mu_s: Cosine, nu: Cosine, ground: Bool[Array, "..."]
+    ) -> Float[Array, "... w"]:
+        air, aerosol = (look_up(planet, part, altitude, mu, mu_s, nu, ground) for part in (rayleigh, mie))
+        peak = phase.mie(nu, atmosphere.mie_g, atmosphere.mie_phase)
+        return phase.rayleigh(nu)[..., None] * air + peak[..., None] * aerosol
+
+    return light
 
 
 def look_up(
@@ -195,8 +193,7 @@ def compute_scattering_density(
     planet: Planet,
     transmittance: Float[Array, "r mu w"],
     irradiance: Float[Array, "r s w"],
-    first: tuple[Scattered, Scattered] | None,
-    further: Scattered | None,
+    incident: Incident,
     count: int,
 ) -> Scattered:
     """ΔJ: light of the last order, and light of the last order reflected by the ground, scattered once more (eq. 8)."""
@@ -214,15 +211,13 @@ def compute_scattering_density(
         # Where the light comes from; axes θ, φ, s.
         mu, mu_s = cos_theta[:, None, None], axes.mu_s
         nu = mu * mu_s + sin_theta[:, None, None] * geometry.sine(mu_s) * azimuth[:, None]
-        light = incident(planet, first, further, atmosphere, altitude, mu, mu_s, nu, ground[:, None, None])
+        light = incident(altitude, mu, mu_s, nu, ground[:, None, None])
         reach = jnp.where(
             ground, geometry.distance_down(start, cos_theta, jnp.zeros_like(start), planet.bottom_radius), 0
         )
         survives = to_ground(planet, transmittance, start, cos_theta, ground)
-        mu_s_ground = ((planet.bottom_radius + altitude) * mu_s + reach[:, None, None] * nu) / planet.bottom_radius
-        falling = bilinear(
-            irradiance, *planet.irradiance_position(jnp.zeros_like(mu_s_ground), jnp.clip(mu_s_ground, -1, 1))
-        )
+        mu_s_ground = planet.cosine_after(altitude, mu_s, nu, reach[:, None, None], 0.0)
+        falling = bilinear(irradiance, *planet.irradiance_position(jnp.zeros_like(mu_s_ground), mu_s_ground))
         reflected = (atmosphere.ground_albedo / jnp.pi * survives)[:, None, None] * falling
         light = light + jnp.where(ground[:, None, None, None], reflected, 0)
         light = jnp.einsum("nf,tfsw->ntsw", harmonics, light) * weight[:, None, None]
@@ -244,13 +239,7 @@ def compute_scattering_density(
     return jax.lax.map(at, planet.altitudes())
 
 
-def compute_indirect_irradiance(
-    atmosphere: Atmosphere,
-    planet: Planet,
-    first: tuple[Scattered, Scattered] | None,
-    further: Scattered | None,
-    count: int,
-) -> Float[Array, "r s w"]:
+def compute_indirect_irradiance(planet: Planet, incident: Incident, count: int) -> Float[Array, "r s w"]:
     """ΔE: light of one order of scattering on a horizontal plane (paper, eq. 10)."""
     altitudes, mu_s = planet.irradiance_nodes()
     cos_theta, weight = (jnp.asarray(a[: count // 2], mu_s.dtype) for a in _midpoints(count))
@@ -259,7 +248,7 @@ def compute_indirect_irradiance(
     nu = mu * mu_s + geometry.sine(mu) * geometry.sine(mu_s) * azimuth[:, None]
 
     def at(altitude: Scalar) -> Array:
-        light = incident(planet, first, further, atmosphere, altitude, mu, mu_s, nu, jnp.zeros(nu.shape, bool))
+        light = incident(altitude, mu, mu_s, nu, jnp.zeros(nu.shape, bool))
         return 2 * jnp.pi * jnp.einsum("t,tsw->sw", weight * cos_theta, jnp.mean(light, axis=1))
 
     return jax.lax.map(jax.checkpoint(at), altitudes)
@@ -316,21 +305,19 @@ def precompute(
     irradiance, total = jnp.zeros_like(delta_e), rayleigh
     toward = jax.vmap(lambda altitude: phase.rayleigh(_axes(planet, altitude).nu))(planet.altitudes())[..., None]
 
-    def order(
-        first: tuple[Scattered, Scattered] | None, further: Scattered | None, delta_e: Irradiance
-    ) -> tuple[Scattered, Irradiance]:
-        density = compute_scattering_density(atmosphere, planet, transmittance, delta_e, first, further, steps.density)
-        falling = compute_indirect_irradiance(atmosphere, planet, first, further, steps.irradiance)
+    def order(incident: Incident, delta_e: Irradiance) -> tuple[Scattered, Irradiance]:
+        density = compute_scattering_density(atmosphere, planet, transmittance, delta_e, incident, steps.density)
+        falling = compute_indirect_irradiance(planet, incident, steps.irradiance)
         return compute_multiple_scattering(planet, transmittance, density, steps.multiple), falling
 
     if orders > 1:
-        delta_s, delta_e = order((rayleigh, mie), None, delta_e)
+        delta_s, delta_e = order(of_first_order(atmosphere, planet, rayleigh, mie), delta_e)
         irradiance, total = irradiance + delta_e, total + delta_s / toward
         if orders > 2:
 
             def next_order(carry: Any, _: None) -> tuple[Any, None]:
                 delta_s, delta_e, irradiance, total = carry
-                delta_s, delta_e = order(None, delta_s, delta_e)
+                delta_s, delta_e = order(partial(look_up, planet, delta_s), delta_e)
                 return (delta_s, delta_e, irradiance + delta_e, total + delta_s / toward), None
 
             carry = (delta_s, delta_e, irradiance, total)

@@ -151,7 +151,7 @@ class HillaireView(View):
         down = to_ground(planet, transmittance, start, mu_in, ground)
         survives = jnp.where(ground[..., None], down, to_top(planet, transmittance, start, mu_in))
         reach = geometry.distance_down(start, mu_in, jnp.zeros_like(start), radius)
-        mu_s_ground = jnp.clip(((radius + start) * mu_s_in + reach * nu) / radius, -1, 1)
+        mu_s_ground = planet.cosine_after(start, mu_s_in, nu, reach, 0.0)
         light = light + jnp.where(ground[..., None], survives * sky.ground_radiance(mu_s=mu_s_ground), 0)
         return Ray(jnp.where(misses[..., None], 0, light), jnp.where(misses[..., None], 1, survives))
 

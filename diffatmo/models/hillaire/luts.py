@@ -98,14 +98,13 @@ def march(
     """
     peak = phase.mie(nu, atmosphere.mie_g, atmosphere.mie_phase)[..., None]
     air = phase.rayleigh(nu)[..., None]
-    radius = planet.bottom_radius
 
     def step(carry: tuple[Array, Array, Array], end: Array) -> tuple[tuple[Array, Array, Array], tuple[Array, Array]]:
         begin, light, survives = carry
         length = end - begin
         middle = (begin + end) / 2
-        here = jnp.clip(geometry.altitude_along(altitude, mu, middle, radius), 0, planet.top_altitude)
-        mu_s_here = jnp.clip(((radius + altitude) * mu_s + middle * nu) / (radius + here), -1, 1)
+        here = planet.altitude_after(altitude, mu, middle)
+        mu_s_here = planet.cosine_after(altitude, mu_s, nu, middle, here)
         medium = Medium.at(atmosphere, here)
         sun = atmosphere.solar_irradiance * to_sun(planet, transmittance, here, mu_s_here, SUN_ANGULAR_RADIUS)
         psi = bilinear(multiple, *multiple_position(planet, here, mu_s_here, multiple.shape[:2]))
@@ -150,15 +149,14 @@ def compute_multiple(
     ground = geometry.hits_ground(start, mu, planet.bottom_radius)
     length = geometry.distance_to_boundary(start, mu, ground, planet.bottom_radius, planet.top_altitude)
     sun_zenith = mu_s[:, None, None, None]
-    radius = planet.bottom_radius
     isotropic = 1 / (4 * jnp.pi)
 
     def step(carry: tuple[Array, Array, Array], i: Array) -> tuple[tuple[Array, Array, Array], None]:
         second, ratio, survives = carry
         dt = length / steps
         distance = (i + 0.5) * dt
-        here = jnp.clip(geometry.altitude_along(start, mu, distance, radius), 0, planet.top_altitude)
-        mu_s_here = jnp.clip(((radius + start) * sun_zenith + distance * nu) / (radius + here), -1, 1)
+        here = planet.altitude_after(start, mu, distance)
+        mu_s_here = planet.cosine_after(start, sun_zenith, nu, distance, here)
         medium = Medium.at(atmosphere, here)
         scattering = medium.rayleigh + medium.mie
         depth = medium.extinction * dt[..., None]
@@ -170,7 +168,7 @@ def compute_multiple(
     zero = jnp.zeros((*length.shape, bands), mu_s.dtype)
     dark = jnp.zeros((*nu.shape, bands), mu_s.dtype)
     (second, ratio, survives), _ = jax.lax.scan(step, (dark, zero, zero + 1), jnp.arange(steps))
-    mu_s_ground = jnp.clip(((radius + start) * sun_zenith + length * nu) / radius, -1, 1)
+    mu_s_ground = planet.cosine_after(start, sun_zenith, nu, length, 0.0)
     at_ground = to_sun(planet, transmittance, jnp.zeros_like(mu_s_ground), mu_s_ground, SUN_ANGULAR_RADIUS)
     lit = jnp.maximum(mu_s_ground, 0)[..., None] * at_ground
     reflected = atmosphere.ground_albedo / jnp.pi * survives * lit
