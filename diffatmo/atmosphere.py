@@ -38,13 +38,10 @@ class DensityProfile(eqx.Module):
 
     def __call__(self, altitude: Altitude) -> Float[Array, "..."]:
         """Relative density (1 at the reference level) at ``altitude``, km."""
-        lower, upper = (
-            self.exp_term[i] * jnp.exp(self.exp_scale[i] * altitude)
-            + self.linear_term[i] * altitude
-            + self.constant_term[i]
-            for i in (0, 1)
-        )
-        density = jnp.where(altitude < self.width, lower, upper)
+        # The layer first, then its formula: one exponential, not two.
+        layer = (self.exp_term, self.exp_scale, self.linear_term, self.constant_term)
+        term, scale, linear, constant = (jnp.where(altitude < self.width, x[0], x[1]) for x in layer)
+        density = term * jnp.exp(scale * altitude) + linear * altitude + constant
         return jnp.where(density > 0, density, 0)
 
     @classmethod

@@ -88,7 +88,7 @@ def hillaire(
         Texture("transmittance", np.asarray(sky.luts.transmittance)[None], "width mu, height r", "1", "refraction"),
         Texture(
             "multiple_scattering",
-            np.asarray(sky.luts.multiple).swapaxes(0, 1)[None],
+            np.asarray(sky.luts.multiple)[None],
             "width mu_s, height altitude",
             f"{RADIANCE}: times the scattering coefficient it is what is scattered more than once, per km",
             "light scattered once; any dependence on direction",

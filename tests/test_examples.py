@@ -34,6 +34,15 @@ def test_recover_parameters():
 
 
 @pytest.mark.slow
+def test_model_biases():
+    """Single scattering makes up for the light it misses with less aerosol, and its residuals tell."""
+    result = run("model_biases", "raymarch", "clear")["clear/raymarch"]
+    assert result.reduced_chi2 > 20
+    depth = next(e for e in result.parameters if e.field == "mie_optical_depth")
+    assert depth.pull < -5
+
+
+@pytest.mark.slow
 def test_tune_colour(tmp_path):
     assert run("tune_colour", str(tmp_path / "sky.png"), "24") < 0.05
     assert imageio.read_image(tmp_path / "sky.png", transfer="srgb").pixels.shape == (16, 24, 3)

@@ -22,6 +22,7 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from diffatmo import geometry
@@ -244,9 +245,30 @@ def taps(position: Float[Array, "..."], count: int) -> tuple[Int[Array, "..."], 
     return first, position - first
 
 
+def _linear(table: Float[Array, "nx *c"], x: Float[Array, "..."]) -> Float[Array, "..."]:
+    first, part = taps(x, table.shape[0])
+    weight = part.reshape(*part.shape, *(1,) * (table.ndim - 1))
+    return table[first] * (1 - weight) + table[first + 1] * weight
+
+
+def _along_rows(rows: Float[Array, "..."], y: Float[Array, "... k"]) -> Float[Array, "..."]:
+    """Linear lookup in a table of its own for each of the leading entries of ``y``."""
+    lead, ny = y.shape[:-1], rows.shape[y.ndim - 1]
+    flat = rows.reshape(-1, *rows.shape[y.ndim :])
+    start = (np.arange(math.prod(lead)) * ny).reshape(*lead, 1)
+    first, part = taps(y, ny)
+    weight = part.reshape(*part.shape, *(1,) * (flat.ndim - 1))
+    return flat[start + first] * (1 - weight) + flat[start + first + 1] * weight
+
+
 def bilinear(table: Float[Array, "nx ny *c"], x: Float[Array, "..."], y: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Bilinear lookup at positions ``x`` and ``y`` of the two leading axes."""
+    """Bilinear lookup at positions ``x`` and ``y`` of the two leading axes.
+
+    Where ``x`` has one entry for all along the last axis of ``y``, it is interpolated first, once for all of them.
+    """
     nx, ny = table.shape[:2]
+    if x.ndim == y.ndim > 0 and x.shape[-1] == 1 < y.shape[-1] and x.shape[:-1] == y.shape[:-1]:
+        return _along_rows(_linear(table, x[..., 0]), y)
     flat = table.reshape(nx * ny, *table.shape[2:])
     (ix, fx), (iy, fy) = taps(x, nx), taps(y, ny)
     extra = (1,) * (table.ndim - 2)

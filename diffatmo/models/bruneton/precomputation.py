@@ -23,7 +23,7 @@ from diffatmo import geometry, phase, table
 from diffatmo._types import Altitude, Cosine, Irradiance, Length, Scalar
 from diffatmo.atmosphere import Atmosphere
 from diffatmo.models.tables import Planet, bilinear, possible, taps
-from diffatmo.models.transmittance_table import between, compute_transmittance, sun_seen, to_ground, to_top, trapezoid
+from diffatmo.models.transmittance_table import between, compute_transmittance, to_ground, to_sun, to_top, trapezoid
 from diffatmo.numerics import safe_divide
 
 Scattered = Float[Array, "r m v s w"]
@@ -111,18 +111,10 @@ def compute_single_scattering(
             distance = axes.length * (i / steps)
             there, _, mu_s = _along(planet, axes, distance)
             view = between(planet, transmittance, start, axes.mu, distance, axes.ground)
-            # T towards the sun: first the row of the table at this altitude, then its entries.
-            here = there[:, None, None]
-            p_r, p_mu = planet.transmittance_position(jnp.broadcast_to(here, mu_s.shape), mu_s)
-            first_r, part_r = taps(p_r[:, 0, 0], planet.sizes.transmittance_r)
-            rows = (
-                transmittance[first_r] * (1 - part_r)[:, None, None]
-                + transmittance[first_r + 1] * part_r[:, None, None]
-            )
-            first, part = taps(p_mu, planet.sizes.transmittance_mu)
-            ray = jnp.arange(rows.shape[0])[:, None, None]
-            sun = rows[ray, first] * (1 - part)[..., None] + rows[ray, first + 1] * part[..., None]
-            sun = sun * sun_seen(planet, here, mu_s, sun_angular_radius)[..., None]
+            # All suns of a ray share the row of the table at this altitude.
+            suns = mu_s.reshape(mu_s.shape[0], -1)
+            sun = to_sun(planet, transmittance, there[:, None], suns, sun_angular_radius)
+            sun = sun.reshape(*mu_s.shape, -1)
             weight = (trapezoid(i, steps) * axes.length)[:, None] * view
             air = weight * atmosphere.rayleigh_density(there)[:, None]
             aerosol = weight * atmosphere.mie_density(there)[:, None]

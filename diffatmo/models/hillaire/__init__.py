@@ -117,7 +117,16 @@ class HillaireSky(Sky):
         limit = geometry.distance_to_boundary(start, mu, ground, radius, top)
         ends = jnp.minimum((jnp.arange(1, slices + 1) * (reach / slices))[:, None, None], limit)
         sums = march(
-            self.atmosphere, self.planet, self.luts.transmittance, self.luts.multiple, start, mu, mu_s, nu, ends
+            self.atmosphere,
+            self.planet,
+            self.luts.transmittance,
+            self.luts.multiple,
+            start,
+            mu,
+            mu_s,
+            nu,
+            ends,
+            every=True,
         )
         # In front of the first froxel there is nothing yet.
         nothing = jnp.zeros_like(sums.light[:1])

@@ -36,8 +36,8 @@ class Luts(eqx.Module):
     """The tables that do not depend on the camera."""
 
     transmittance: Float[Array, "r mu w"]
-    multiple: Float[Array, "s h w"]
-    """Ψ_ms (eq. 10) over mu_s in [-1, 1] and altitude, for the given solar irradiance."""
+    multiple: Float[Array, "h s w"]
+    """Ψ_ms (eq. 10) over altitude and mu_s in [-1, 1], for the given solar irradiance."""
     irradiance: Float[Array, "s w"]
     """Of the ground by the sky, over mu_s as in Bruneton's S: not in the paper, whose ground sees the sun only."""
 
@@ -69,12 +69,12 @@ def _mean_survival(depth: Float[Array, "..."]) -> Float[Array, "..."]:
 
 def multiple_position(planet: Planet, altitude: Altitude, mu_s: Cosine, size: tuple[int, ...]) -> tuple[Array, Array]:
     """Position in Ψ_ms."""
-    s, h = (mu_s + 1) / 2, altitude / planet.top_altitude
-    return jnp.clip(s, 0, 1) * (size[0] - 1), jnp.clip(h, 0, 1) * (size[1] - 1)
+    h, s = altitude / planet.top_altitude, (mu_s + 1) / 2
+    return jnp.clip(h, 0, 1) * (size[0] - 1), jnp.clip(s, 0, 1) * (size[1] - 1)
 
 
 class March(NamedTuple):
-    """Sums along a ray, at the end of every step."""
+    """Sums along a ray."""
 
     light: Radiance
     transmittance: Transmittance
@@ -84,22 +84,25 @@ def march(
     atmosphere: Atmosphere,
     planet: Planet,
     transmittance: Float[Array, "r mu w"],
-    multiple: Float[Array, "s h w"],
+    multiple: Float[Array, "h s w"],
     altitude: Altitude,
     mu: Cosine,
     mu_s: Cosine,
     nu: Cosine,
     ends: Float[Array, "n ..."],
+    *,
+    every: bool = False,
 ) -> March:
     """Light scattered towards the start of a ray, in steps that end at ``ends`` km: section 5.5, eq. 1 with eq. 11.
 
-    The source is that in the middle of a step, and the step's own extinction is integrated exactly (Hillaire 2015). Leading
-    axis of the result: the steps.
+    The source is that in the middle of a step, and the step's own extinction is integrated exactly (Hillaire 2015). With
+    ``every`` the sums are those at the end of each step, on a leading axis, else those at the end of the ray. What
+    ``altitude`` and ``mu`` have in common for several suns is computed once.
     """
     peak = phase.mie(nu, atmosphere.mie_g, atmosphere.mie_phase)[..., None]
     air = phase.rayleigh(nu)[..., None]
 
-    def step(carry: tuple[Array, Array, Array], end: Array) -> tuple[tuple[Array, Array, Array], tuple[Array, Array]]:
+    def step(carry: tuple[Array, Array, Array], end: Array) -> tuple[tuple[Array, Array, Array], March | None]:
         begin, light, survives = carry
         length = end - begin
         middle = (begin + end) / 2
@@ -112,12 +115,14 @@ def march(
         depth = medium.extinction * length[..., None]
         light = light + survives * source * length[..., None] * _mean_survival(depth)
         survives = survives * jnp.exp(-depth)
-        return (end, light, survives), (light, survives)
+        return (end, light, survives), March(light, survives) if every else None
 
-    shape = (*jnp.broadcast_shapes(altitude.shape, mu.shape, nu.shape), atmosphere.wavelengths.size)
-    zero = jnp.zeros(shape, mu.dtype)
-    _, sums = jax.lax.scan(step, (jnp.zeros_like(ends[0]), zero, zero + 1), ends)
-    return March(*sums)
+    bands = atmosphere.wavelengths.size
+    rays = jnp.broadcast_shapes(altitude.shape, mu.shape, ends.shape[1:])
+    dark = jnp.zeros((*jnp.broadcast_shapes(rays, mu_s.shape, nu.shape), bands), mu.dtype)
+    clear = jnp.ones((*rays, bands), mu.dtype)
+    (_, *last), each = jax.lax.scan(step, (jnp.zeros_like(ends[0]), dark, clear), ends)
+    return March(*last) if each is None else each
 
 
 def quadratic(length: Length, steps: int) -> Float[Array, "n ..."]:
@@ -127,9 +132,9 @@ def quadratic(length: Length, steps: int) -> Float[Array, "n ..."]:
 
 
 def _directions(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """cosθ of ``count`` rings of equal solid angle, and cos φ of as many azimuths from 0 to 2π."""
-    middle = (np.arange(count) + 0.5) / count
-    return 1 - 2 * middle, np.cos(2 * np.pi * middle)
+    """cosθ of ``count`` rings of equal solid angle, and cos φ of as many azimuths: those on one side of the sun's plane."""
+    half = -(-count // 2)
+    return 1 - 2 * (np.arange(count) + 0.5) / count, np.cos(np.pi * (np.arange(half) + 0.5) / half)
 
 
 def compute_multiple(
@@ -139,16 +144,16 @@ def compute_multiple(
     size: tuple[int, int],
     steps: int,
     directions: int,
-) -> Float[Array, "s h w"]:
+) -> Float[Array, "h s w"]:
     """Ψ_ms (section 5.5.3): the second order L_2 and the ratio f_ms of each order to the one before, all isotropic."""
     mu_s, altitude = jnp.linspace(-1, 1, size[0]), jnp.linspace(0, 1, size[1]) * planet.top_altitude
     cosines, azimuths = (jnp.asarray(a, mu_s.dtype) for a in _directions(directions))
-    # Axes: s, h, θ, φ.
+    # Axes: h, θ, then φ and s in one, for which the place along the ray is the same.
     start, mu = jnp.broadcast_arrays(altitude[:, None, None], cosines[:, None])
-    nu = mu * mu_s[:, None, None, None] + geometry.sine(mu) * geometry.sine(mu_s)[:, None, None, None] * azimuths
+    sun_zenith = jnp.tile(mu_s, azimuths.size)
+    nu = mu * sun_zenith + geometry.sine(mu) * geometry.sine(sun_zenith) * jnp.repeat(azimuths, size[0])
     ground = geometry.hits_ground(start, mu, planet.bottom_radius)
     length = geometry.distance_to_boundary(start, mu, ground, planet.bottom_radius, planet.top_altitude)
-    sun_zenith = mu_s[:, None, None, None]
     isotropic = 1 / (4 * jnp.pi)
 
     def step(carry: tuple[Array, Array, Array], i: Array) -> tuple[tuple[Array, Array, Array], None]:
@@ -161,7 +166,7 @@ def compute_multiple(
         scattering = medium.rayleigh + medium.mie
         depth = medium.extinction * dt[..., None]
         within = survives * scattering * dt[..., None] * _mean_survival(depth)
-        sun = to_sun(planet, transmittance, jnp.broadcast_to(here, mu_s_here.shape), mu_s_here, SUN_ANGULAR_RADIUS)
+        sun = to_sun(planet, transmittance, here, mu_s_here, SUN_ANGULAR_RADIUS)
         return (second + within * sun * isotropic, ratio + within, survives * jnp.exp(-depth)), None
 
     bands = atmosphere.wavelengths.size
@@ -172,8 +177,9 @@ def compute_multiple(
     at_ground = to_sun(planet, transmittance, jnp.zeros_like(mu_s_ground), mu_s_ground, SUN_ANGULAR_RADIUS)
     lit = jnp.maximum(mu_s_ground, 0)[..., None] * at_ground
     reflected = atmosphere.ground_albedo / jnp.pi * survives * lit
-    second = jnp.mean(second + jnp.where(ground[..., None], reflected, 0), axis=(2, 3))
-    ratio = jnp.mean(ratio, axis=(1, 2))
+    second = second + jnp.where(ground[..., None], reflected, 0)
+    second = jnp.mean(second.reshape(*second.shape[:2], azimuths.size, size[0], bands), axis=(1, 2))
+    ratio = jnp.mean(ratio, axis=1)
     # Between a white ground and conservative air the ratio nears one.
     return atmosphere.solar_irradiance * second / (1 - jnp.minimum(ratio, 0.999))
 
@@ -191,7 +197,7 @@ def compute(atmosphere: Atmosphere, planet: Planet, multiple_size: tuple[int, in
     level = jnp.zeros_like(mu)
     length = geometry.distance_up(level, mu, planet.top_altitude, planet.bottom_radius)
     ends = quadratic(length, steps.multiple)
-    light = march(atmosphere, planet, transmittance, multiple, level, mu, mu_s, nu, ends).light[-1]
+    light = march(atmosphere, planet, transmittance, multiple, level, mu, mu_s, nu, ends).light
     return Luts(transmittance, multiple, jnp.pi * jnp.mean(light, axis=(0, 1)))
 
 
@@ -264,7 +270,7 @@ def cast(
 ) -> Path:
     """The ray march from anywhere to the end of the ray or to ``distance`` km."""
     radius, top = planet.bottom_radius, planet.top_altitude
-    altitude, mu, mu_s, nu = jnp.broadcast_arrays(altitude, mu, mu_s, nu)
+    altitude, mu = jnp.broadcast_arrays(altitude, mu)
     start, mu_in, mu_s_in, moved, misses = geometry.enter_atmosphere(altitude, mu, mu_s, nu, radius, top)
     hits = geometry.hits_ground(altitude, mu, radius) if ground is None else jnp.broadcast_to(ground, mu.shape)
     end = geometry.distance_to_boundary(start, mu_in, hits, radius, top)
@@ -273,5 +279,6 @@ def cast(
     sums = march(
         atmosphere, planet, luts.transmittance, luts.multiple, start, mu_in, mu_s_in, nu, quadratic(end, steps)
     )
-    light, survives = sums.light[-1], sums.transmittance[-1]
-    return Path(jnp.where(misses[..., None], 0, light), jnp.where(misses[..., None], 1, survives))
+    light, survives = sums
+    survives = jnp.where(misses[..., None], 1, survives)
+    return Path(jnp.where(misses[..., None], 0, light), jnp.broadcast_to(survives, light.shape))
