@@ -28,7 +28,8 @@ def model_options(command: Any) -> Any:
                 type=click.Choice(MODELS),
                 default=MODELS[0],
                 show_default=True,
-                help="moments: all orders of scattering; raymarch: single scattering; pathtrace: Monte Carlo.",
+                help="moments: all orders of scattering; bruneton, hillaire: the tables of those papers; raymarch: single "
+                "scattering; pathtrace: Monte Carlo.",
             ),
             click.option("--samples", type=click.IntRange(min=32), help="Paths per ray of pathtrace.  [default: 4096]"),
             click.option(

@@ -59,6 +59,7 @@ def main(full_derivative: bool) -> None:
     ):  # fmt: skip
         first, median, least = timed(function, *arguments, repeats=repeats)
         table.add_row(what, f"{first:.1f}", f"{1e3 * median:.0f}", f"{1e3 * least:.0f}", "")
+        print(what, first, median, flush=True)
     for model, what in ((reduced, "reduced"), *[(bruneton, "full")] * full_derivative):
         image, x = nine(model, air, towards, small)
         compiled = jax.jit(jax.jacfwd(image)).lower(x).compile(compiler_options=diffatmo.compiler_options())
@@ -66,6 +67,7 @@ def main(full_derivative: bool) -> None:
         gigabytes = compiled.memory_analysis().temp_size_in_bytes / 1e9
         row = f"bruneton, {what}: Jacobian in 9 parameters"
         table.add_row(row, f"{first:.1f}", f"{1e3 * median:.0f}", f"{1e3 * least:.0f}", f"{gigabytes:.2f}")
+        print(row, first, median, gigabytes, flush=True)
     Console(width=120).print(table)
 
 
