@@ -37,7 +37,6 @@ import io
 import json
 import math
 import re
-import tempfile
 from collections.abc import Callable, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -56,7 +55,7 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 from rich.text import Text
 
-from diffatmo import atmosphere, color, imageio, scene, sun
+from diffatmo import atmosphere, color, folders, imageio, scene, sun
 from diffatmo.atmosphere import Atmosphere
 from diffatmo.render import Scene
 from fitting._errors import FitError
@@ -81,14 +80,9 @@ def check_writable(directory: str | Path, *, overwrite: bool = False) -> Path:
     """
     path = Path(directory)
     try:
-        path.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=path):
-            pass
-    except OSError as error:
-        raise FitError(f"{path}: cannot be written to: {error.strerror}") from error
-    present = sorted(f.name for f in path.iterdir() if f.name in FIXED_NAMES or f.name.startswith(IMAGE_PREFIXES))
-    if present and not overwrite:
-        raise FitError(f"{path}: holds a report already ({present[0]}); choose another directory, or overwrite it")
+        folders.prepare(path, names=FIXED_NAMES, prefixes=IMAGE_PREFIXES, overwrite=overwrite)
+    except folders.FolderError as error:
+        raise FitError(str(error)) from error
     return path
 
 

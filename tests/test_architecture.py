@@ -10,14 +10,14 @@ from pathlib import Path
 import pytest
 
 import diffatmo
-from diffatmo.cli import common
+from diffatmo.cli import common, export, scenefile
 
 ROOT = Path(__file__).parent.parent
 
 # One row per level; a module may import from any earlier row, never from its own. A package's own name means its
 # __init__.py.
 LEVELS = [
-    ["diffatmo._types", "diffatmo.constants", "diffatmo.compiling"],
+    ["diffatmo._types", "diffatmo.constants", "diffatmo.compiling", "diffatmo.folders"],
     ["diffatmo.numerics"],
     [f"diffatmo.{name}" for name in ("geometry", "phase", "table", "spectrum", "color", "codecs", "camera", "sun")],
     ["diffatmo.rays", "diffatmo.atmosphere"],
@@ -122,8 +122,11 @@ def test_public_names_resolve():
 
 def test_model_names_of_the_command_line():
     from diffatmo import models
+    from diffatmo.models import tables
 
     assert tuple(models.MODELS) == common.MODELS
+    assert set(scenefile.MODELS) == set(models.MODELS) - {"pathtrace"}
+    assert export.PARAMETERISATIONS == tables.PARAMETERISATIONS
 
 
 def test_help_imports_no_jax():

@@ -104,9 +104,9 @@ def test_nothing_is_overwritten_unless_asked(tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
     assert report.check_writable(tmp_path) == tmp_path
     (tmp_path / "fitted_x.png").write_text("old")
-    with pytest.raises(FitError, match="holds a report already"):
+    with pytest.raises(FitError, match="holds results already"):
         report.check_writable(tmp_path)
-    with pytest.raises(FitError, match="holds a report already"):
+    with pytest.raises(FitError, match="holds results already"):
         report.write(toy_sky.result(), tmp_path)
     assert report.check_writable(tmp_path, overwrite=True) == tmp_path
     assert (tmp_path / "notes.txt").read_text() == "mine"

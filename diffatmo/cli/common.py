@@ -1,11 +1,11 @@
 """What the subcommands share: their error, the choice of a model, and the checks of what they read and write."""
 
-import tempfile
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+
+from diffatmo import folders
 
 if TYPE_CHECKING:
     from diffatmo.atmosphere import Atmosphere
@@ -61,30 +61,9 @@ def check_output(path: Path, *, overwrite: bool) -> None:
         raise InputError(f"{path}: is a directory, expected the name of a file to write")
     if not overwrite and path.exists() and path.stat().st_size:
         raise InputError(f"{path}: exists; give --overwrite to replace it")
-    check_writable(path.parent)
-
-
-def check_writable(directory: Path) -> None:
-    """Refuse a directory that does not exist or that no file can be created in."""
-    if not directory.is_dir():
-        raise InputError(f"{directory}: no such directory")
-    try:
-        with tempfile.TemporaryFile(dir=directory):
-            pass
-    except OSError as error:
-        raise InputError(f"{directory}: cannot be written to: {error.strerror}") from error
-
-
-def check_folder(directory: Path, *, present: Sequence[str], prefixes: Sequence[str] = (), overwrite: bool) -> None:
-    """Create ``directory`` if need be; refuse one that holds results of these names already, or cannot be written to."""
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{directory}: cannot be written to: {error.strerror}") from error
-    check_writable(directory)
-    taken = sorted(f.name for f in directory.iterdir() if f.name in present or f.name.startswith(tuple(prefixes)))
-    if taken and not overwrite:
-        raise InputError(f"{directory}: holds results already ({taken[0]}); give --overwrite to replace them")
+    if not path.parent.is_dir():
+        raise InputError(f"{path.parent}: no such directory")
+    folders.check_writable(path.parent)
 
 
 def make_model(name: str, *, samples: int | None = None, seed: int | None = None) -> "Model":

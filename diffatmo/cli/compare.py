@@ -6,10 +6,11 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from diffatmo import folders
 from diffatmo.cli import keys
-from diffatmo.cli.common import MODELS, InputError, check_folder, make_model, overwrite_option, read_atmosphere
+from diffatmo.cli.common import MODELS, InputError, make_model, overwrite_option, read_atmosphere
 from diffatmo.cli.keys import CAMERA_KEYS, PLACE_KEYS
-from diffatmo.cli.render import DEFAULTS, SIZE, picture_size
+from diffatmo.cli.render import DEFAULTS, SIZE, make_scene
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -91,13 +92,13 @@ def compare(
     """
     given = CENTRED | keys.given(CAMERA_KEYS | PLACE_KEYS, values)
     keys.check_camera_options(given)
-    check_folder(output, present=FILES, prefixes=PREFIXES, overwrite=overwrite)
+    folders.prepare(output, names=FILES, prefixes=PREFIXES, overwrite=overwrite)
     names = list(dict.fromkeys([truth, *models]))
     from rich.console import Console
 
     from diffatmo import comparison
 
-    scene = _scene(atmosphere, given, width, height)
+    scene = make_scene(read_atmosphere(atmosphere), given, width, height)
     console = Console(width=None if Console().is_terminal else 120)
     outcomes: dict[str, Outcome] = {}
     for name in names:
@@ -108,17 +109,6 @@ def compare(
     _write(output, scene, outcomes, found, truth)
     console.print(_table(outcomes, found, truth))
     console.print(f"Pictures and report: {output / 'compare.html'}", soft_wrap=True)
-
-
-def _scene(atmosphere: str, options: dict[str, Any], width: int, height: int | None) -> "Scene":
-    from diffatmo import render, sun
-
-    columns, rows = picture_size(options, width, height)
-    towards = sun.direction(
-        zenith=math.radians(options["sun_zenith_deg"]), azimuth=math.radians(options["sun_azimuth_deg"])
-    )
-    camera = keys.make_camera({k: v for k, v in options.items() if k in CAMERA_KEYS}, height=rows, width=columns)
-    return render.Scene(read_atmosphere(atmosphere), camera, options["altitude_km"], towards)
 
 
 def _cells(name: str, outcome: "Outcome", found: "Errors", truth: str) -> list[str]:

@@ -1,16 +1,16 @@
 """``diffatmo export``: the tables of Bruneton or Hillaire, for a renderer."""
 
-import math
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from diffatmo import folders
 from diffatmo.cli import keys
-from diffatmo.cli.common import InputError, check_folder, overwrite_option, read_atmosphere
+from diffatmo.cli.common import InputError, overwrite_option, read_atmosphere
 from diffatmo.cli.keys import CAMERA_KEYS, PLACE_KEYS, Number
-from diffatmo.cli.render import DEFAULTS, SIZE, picture_size
+from diffatmo.cli.render import DEFAULTS, SIZE, make_scene
 
 if TYPE_CHECKING:
     from diffatmo.atmosphere import Atmosphere
@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 LUTS = ("bruneton", "hillaire")
 PARAMETERISATIONS = ("2017", "2008")
+"""Those of ``diffatmo.models.tables``, repeated here because importing that takes seconds; a test compares the two."""
+
 FOLDERS = ("float", "half", "README.md")
 VOLUME_KEYS = {"reach_km": Number("How far the aerial perspective reaches.", 0, positive=True)}
 VIEWED = DEFAULTS | {"projection": "pinhole", "reach_km": 32.0}
@@ -69,7 +71,7 @@ def export(
         raise InputError(f"{keys.flag_of(name)} contradicts --luts {luts}: it belongs to the other one")
     options = VIEWED | of_place
     keys.check_camera_options(options)
-    check_folder(output, present=FOLDERS, overwrite=overwrite)
+    folders.prepare(output, names=FOLDERS, overwrite=overwrite)
     from rich.console import Console
     from rich.table import Table
 
@@ -125,18 +127,13 @@ def _hillaire(
 ) -> "tuple[list[Texture], str, dict[str, Any]]":
     from diffatmo import camera as cameras
     from diffatmo import export as tables
-    from diffatmo import sun
     from diffatmo.models import Hillaire
 
     model = Hillaire()
-    columns, rows = picture_size(options, width, height)
-    camera = keys.make_camera({k: v for k, v in options.items() if k in CAMERA_KEYS}, height=rows, width=columns)
-    towards = sun.direction(
-        zenith=math.radians(options["sun_zenith_deg"]), azimuth=math.radians(options["sun_azimuth_deg"])
-    )
-    reach = float(options["reach_km"])
+    scene = make_scene(air, options, width, height)
+    camera, reach = scene.camera, float(options["reach_km"])
     textures = tables.hillaire(
-        air, model, altitude=options["altitude_km"], sun=towards, camera=camera, reach=reach
+        air, model, altitude=options["altitude_km"], sun=scene.sun, camera=camera, reach=reach
     )  # fmt: skip
     facts = {
         "bottom": f"{float(air.bottom_radius):g}",

@@ -21,6 +21,7 @@ from diffatmo.cli.keys import CAMERA_KEYS, PLACE_KEYS, Number
 if TYPE_CHECKING:
     import numpy as np
 
+    from diffatmo.atmosphere import Atmosphere
     from diffatmo.render import Scene
 
 EXPOSURE = {
@@ -76,25 +77,27 @@ def render(
         check_output(path, overwrite=overwrite)
     import numpy as np
 
-    from diffatmo import render, sun
+    from diffatmo import render
     from diffatmo.compiling import outermost
 
     chosen = make_model(model, samples=samples, seed=seed)
     air = read_atmosphere(atmosphere)
-    width, height = picture_size(options, width, height)
-    camera = keys.make_camera({k: v for k, v in options.items() if k in CAMERA_KEYS}, height=height, width=width)
-    scene = render.Scene(
-        atmosphere=air,
-        camera=camera,
-        altitude=options["altitude_km"],
-        sun=sun.direction(
-            zenith=math.radians(options["sun_zenith_deg"]), azimuth=math.radians(options["sun_azimuth_deg"])
-        ),
-        exposure=options.get("exposure", 1.0),
-    )
+    scene = make_scene(air, options, width, height)
     pixels = np.asarray(outermost(render.render)(scene, chosen, sun_disc=sun_disc))
     for path, write in writers:
         write(path, pixels, scene, {"model": model, "sun_disc": sun_disc}, "exposure" not in given)
+
+
+def make_scene(air: "Atmosphere", options: Mapping[str, Any], width: int | None, height: int | None) -> "Scene":
+    """What ``options``, with the keys of ``DEFAULTS`` at least, say is to be seen."""
+    from diffatmo import render, sun
+
+    width, height = picture_size(options, width, height)
+    camera = keys.make_camera({k: v for k, v in options.items() if k in CAMERA_KEYS}, height=height, width=width)
+    towards = sun.direction(
+        zenith=math.radians(options["sun_zenith_deg"]), azimuth=math.radians(options["sun_azimuth_deg"])
+    )
+    return render.Scene(air, camera, options["altitude_km"], towards, options.get("exposure", 1.0))
 
 
 def picture_size(options: Mapping[str, Any], width: int | None, height: int | None) -> tuple[int, int]:
