@@ -9,6 +9,7 @@ python examples/model_biases.py [MODEL,...] [NAME,...]
 
 import sys
 import time
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -22,18 +23,7 @@ from diffatmo.models import Bruneton, Hillaire, Moments, RayMarch
 
 SHIPPED = Path(__file__).resolve().parent.parent / "data_synthetic"
 MODELS = {"moments": Moments(), "bruneton": Bruneton.reduced(), "hillaire": Hillaire(), "raymarch": RayMarch()}
-FREE = (
-    "rayleigh_scattering",
-    "rayleigh_scale_height",
-    "mie_scattering",
-    "mie_absorption",
-    "mie_scale_height",
-    "mie_g",
-    "ozone_absorption",
-    "ground_albedo",
-)
 SHOWN_NM = 550.0
-SCALED = ("mie_scattering", "mie_absorption", "ozone_absorption")
 
 
 def observations(folder: Path) -> list[fitting.Observation]:
@@ -63,10 +53,11 @@ def main(models: str = ",".join(MODELS), names: str = "clear,hazy", width: str =
     for name in names.split(","):
         folder = SHIPPED / name
         truth, start = (diffatmo.load(folder / file) for file in ("truth.toml", "start.toml"))
-        pictures = observations(folder)
+        pictures, wanted = observations(folder), tomllib.loads((folder / "scene.toml").read_text(encoding="utf-8"))
+        free, scaled = wanted["free"], wanted["scaled"]
         for model in models.split(","):
             before = time.perf_counter()
-            result = fitting.fit(pictures, init=start, free=FREE, scaled=SCALED, model=MODELS[model]).with_truth(truth)
+            result = fitting.fit(pictures, init=start, free=free, scaled=scaled, model=MODELS[model]).with_truth(truth)
             results[f"{name}/{model}"] = result
             console.print(
                 f"{name}, {model}: reduced χ² {result.reduced_chi2:.3g}, {result.message} "
