@@ -39,7 +39,7 @@ FREE = (
     "ozone_absorption",
     "ground_albedo",
 )
-SCALED = ("mie_scattering", "mie_absorption", "ozone_absorption")
+TIE = dict.fromkeys(("mie_scattering", "mie_absorption", "ozone_absorption"), "start")
 OFF = 1.3
 """The start is off by this factor: optical depths, products of a coefficient and a height, by its square."""
 TOO_HIGH = ("rayleigh_scattering", "rayleigh_scale_height", "mie_absorption", "ozone_absorption")
@@ -146,7 +146,8 @@ def main(directory: Path) -> None:
             )
             print(f"{folder / file}: Monte Carlo standard error {100 * relative:.2f} %", flush=True)
         quoted = lambda names: ", ".join(f'"{item}"' for item in names)
-        head = f'init = "start.toml"\nfree = [{quoted(FREE)}]\nscaled = [{quoted(SCALED)}]\n'
+        ties = ", ".join(f'{field} = "{kind}"' for field, kind in TIE.items())
+        head = f'init = "start.toml"\nfree = [{quoted(FREE)}]\ntie = {{ {ties} }}\n'
         (folder / "scene.toml").write_text("\n".join([head, *tables]))
 
 

@@ -54,10 +54,10 @@ def main(models: str = ",".join(MODELS), names: str = "clear,hazy", width: str =
         folder = SHIPPED / name
         truth, start = (diffatmo.load(folder / file) for file in ("truth.toml", "start.toml"))
         pictures, wanted = observations(folder), tomllib.loads((folder / "scene.toml").read_text(encoding="utf-8"))
-        free, scaled = wanted["free"], wanted["scaled"]
+        free, tie = wanted["free"], wanted["tie"]
         for model in models.split(","):
             before = time.perf_counter()
-            result = fitting.fit(pictures, init=start, free=free, scaled=scaled, model=MODELS[model]).with_truth(truth)
+            result = fitting.fit(pictures, init=start, free=free, tie=tie, model=MODELS[model]).with_truth(truth)
             results[f"{name}/{model}"] = result
             console.print(
                 f"{name}, {model}: reduced χ² {result.reduced_chi2:.3g}, {result.message} "

@@ -1,156 +1,194 @@
-"""Which numbers of an atmosphere are free, and the coordinates in which they are solved for.
+"""Which numbers of an atmosphere are free, how they hang together, and the coordinates in which they are solved for.
 
-The solver works in coordinates ``y``, and a bijection maps each to a value in its range. One unit of ``y`` is about
-one natural step of the value (a factor e, or one typical size), so that the damping of Levenberg-Marquardt, which is
-isotropic in ``y``, restrains all parameters alike:
+*Columns.* Images determine an optical depth τ = β H far better than its factors (a scale height moves light up and down, an
+optical depth makes it), so the coordinate of a coefficient is that of its column: where the scale height is free as well, the
+coefficient is divided by how much that has grown. The solver thus works in (τ, H), whose correlation is weak; what is
+reported are β, H and τ alike.
 
-==================================  ====================================================================================
-range                               bijection
-==================================  ====================================================================================
-value > lower                       :class:`Log`
-lower < value < upper               :class:`Logit`
-value >= 0, and 0 may be the truth  :class:`Linear`, on a half-line or an interval of ``y``
-==================================  ====================================================================================
+*Ties* say how the numbers of a spectral field hang together:
 
-A clear sky has no absorbing aerosol and a dark sea no albedo, so the bounds of these must be reached, not approached:
-in a coordinate that only tends to zero, all derivatives tend to zero with it, and a search that strays there cannot
-come back. :class:`Linear` coordinates have true limits, at which the solver stops, and from which it returns when χ²
-asks.
+==============  ======================================================================================  =================
+tie             meaning                                                                                 coordinates
+==============  ======================================================================================  =================
+``start``       a common factor times the values of the start                                           1
+``grey``        the same at every wavelength                                                            1
+``lambda^-4``   Rayleigh scattering ∝ λ⁻⁴                                                               1
+``dobson``      the spectrum of ozone's cross section; the factor is its column in Dobson units         1
+``angstrom``    of ``mie``: extinction ∝ λ^-α (Ångström 1929), one single scattering albedo             2 or 3
+==============  ======================================================================================  =================
 """
 
 import difflib
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, TypeAlias
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, TypeAlias
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from diffatmo.atmosphere import FILE_KEYS, SPECTRAL, Atmosphere
+from diffatmo import spectrum
+from diffatmo.atmosphere import SPECTRAL, Atmosphere
 from diffatmo.numerics import safe_divide
 from diffatmo.phase import PhaseTable
 from fitting._errors import FitError
+from fitting.bijections import Bijection, Linear, Log, Logit
+from fitting.quantities import ALWAYS, REFERENCE_NM, derived_fields
 
 Coordinates = Float[Array, " n"]
 
+START, GREY, LAMBDA_4, DOBSON, ANGSTROM = "start", "grey", "lambda^-4", "dobson", "angstrom"
+MIE = "mie"
+"""The aerosol as a whole, which ``angstrom`` ties."""
 
-class Bijection(eqx.Module):
-    """A smooth increasing map from an interval of coordinates onto the range of a value, element by element."""
+TIES: dict[str, tuple[str, ...]] = {
+    START: SPECTRAL[1:],
+    GREY: SPECTRAL[1:],
+    LAMBDA_4: ("rayleigh_scattering",),
+    DOBSON: ("ozone_absorption",),
+    ANGSTROM: (MIE,),
+}
+"""Tie -> what it can be said of."""
 
-    @abstractmethod
-    def value(self, y: Float[Array, "..."]) -> Float[Array, "..."]:
-        """The value at coordinate ``y``."""
-
-    @abstractmethod
-    def coordinate(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
-        """The coordinate of ``value``; may be infinite at the end of its range."""
-
-    @property
-    @abstractmethod
-    def limits(self) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-        """The smallest and largest coordinate, where the value is as good as at its bound."""
-
-
-class Log(Bijection):
-    """value = lower + unit exp(y), within a factor e^±REACH of ``unit``."""
-
-    lower: Float[Array, "..."]
-    unit: Float[Array, "..."]
-
-    REACH = 7.0
-
-    def value(self, y):
-        """See :class:`Bijection`."""
-        return self.lower + self.unit * jnp.exp(y)
-
-    def coordinate(self, value):
-        """See :class:`Bijection`."""
-        return jnp.log((value - self.lower) / self.unit)
-
-    @property
-    def limits(self):
-        """See :class:`Bijection`."""
-        return jnp.full_like(self.unit, -self.REACH), jnp.full_like(self.unit, self.REACH)
-
-
-class Logit(Bijection):
-    """value = lower + (upper - lower) / (1 + exp(-y)), up to e^-REACH of the width from the ends."""
-
-    lower: Float[Array, "..."]
-    upper: Float[Array, "..."]
-
-    REACH = 7.0
-
-    def value(self, y):
-        """See :class:`Bijection`."""
-        return self.lower + (self.upper - self.lower) * jax.nn.sigmoid(y)
-
-    def coordinate(self, value):
-        """See :class:`Bijection`."""
-        fraction = (value - self.lower) / (self.upper - self.lower)
-        return jnp.log(fraction) - jnp.log1p(-fraction)
-
-    @property
-    def limits(self):
-        """See :class:`Bijection`."""
-        return jnp.full_like(self.lower, -self.REACH), jnp.full_like(self.lower, self.REACH)
-
-
-class Linear(Bijection):
-    """value = unit y, from 0 to ``upper`` inclusive."""
-
-    unit: Float[Array, "..."]
-    upper: Float[Array, "..."]
-
-    def value(self, y):
-        """See :class:`Bijection`."""
-        # The product may round to just above the bound.
-        return jnp.where(self.unit * y > self.upper, self.upper, self.unit * y)
-
-    def coordinate(self, value):
-        """See :class:`Bijection`."""
-        return value / self.unit
-
-    @property
-    def limits(self):
-        """See :class:`Bijection`."""
-        return jnp.zeros_like(self.unit), self.upper / self.unit
-
-
-class Quantity(NamedTuple):
-    """What a number of the result is: ``name`` is the field, and its wavelength in nm where it has one."""
-
-    name: str
-    field: str
-    wavelength: float | None
-    unit: str
+_COLUMNS = (
+    ("rayleigh_scattering", "rayleigh_scale_height"),
+    ("mie_scattering", "mie_scale_height"),
+    ("mie_absorption", "mie_scale_height"),
+    ("ozone_absorption", "ozone_half_width"),
+)
+"""Coefficients, and the heights that make columns of them."""
 
 
 class Block(eqx.Module):
-    """One free field: its bijection and where it starts.
+    """Coordinates that belong together, and the fields they set."""
 
-    With ``ratios`` the coordinate is that of a common factor, and the field is the factor times the ratios.
-    """
+    start: eqx.AbstractVar[Coordinates]
+    """The coordinates of the atmosphere at the start, or of what is nearest to it."""
+
+    @property
+    @abstractmethod
+    def fields(self) -> tuple[str, ...]:
+        """The fields that the coordinates set."""
+
+    @property
+    @abstractmethod
+    def spectral(self) -> bool:
+        """Whether coordinate w touches wavelength w alone."""
+
+    @property
+    @abstractmethod
+    def limits(self) -> tuple[Coordinates, Coordinates]:
+        """The smallest and the largest coordinates."""
+
+    @abstractmethod
+    def values(self, y: Coordinates) -> list[Array]:
+        """The value of each field, in its own shape, at these coordinates."""
+
+    @abstractmethod
+    def held(self, y: Float[np.ndarray, " n"]) -> list[Bool[np.ndarray, "..."]]:
+        """For each field, whether its numbers are at a bound; one entry stands for all."""
+
+
+class Single(Block):
+    """One field, each of its numbers free, or, with a ``shape``, the shape times one free factor."""
 
     field: str = eqx.field(static=True)
     bijection: Bijection
     start: Coordinates
-    ratios: Float[Array, " w"] | None
+    shape: Float[Array, " w"] | None
 
-    def value(self, y: Coordinates) -> Float[Array, "..."]:
-        """The field's value, in its own shape, at this block's coordinates."""
-        value = self.bijection.value(y)
-        if self.ratios is not None:
-            return value * self.ratios
-        return value if self.field in SPECTRAL else value[0]
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """See :class:`Block`."""
+        return (self.field,)
 
     @property
     def spectral(self) -> bool:
-        """Whether each wavelength has its own coordinate."""
-        return self.field in SPECTRAL and self.ratios is None
+        """See :class:`Block`."""
+        return self.field in SPECTRAL and self.shape is None
+
+    @property
+    def limits(self) -> tuple[Coordinates, Coordinates]:
+        """See :class:`Block`."""
+        return self.bijection.limits
+
+    def values(self, y):
+        """See :class:`Block`."""
+        value = self.bijection.value(y)
+        if self.shape is not None:
+            return [value * self.shape]
+        return [value if self.field in SPECTRAL else value[0]]
+
+    def held(self, y):
+        """See :class:`Block`."""
+        lower, upper = (np.asarray(limit) for limit in self.limits)
+        return [(y <= lower) | (y >= upper)]
+
+
+class Aerosol(Block):
+    """Extinction (λ / 550 nm)^-α times that at 550 nm, of which a part is absorbed (Ångström 1929).
+
+    Coordinates: the logarithm of the extinction over that of the start, α, and the absorbed part in units of
+    :data:`ABSORBED`, if it is free; else that is a spectrum, ``absorbed``.
+    """
+
+    extinction: Float[Array, ""]
+    absorbed: Float[Array, " w"] | None
+    ratio: Float[Array, " w"]
+    """Wavelength / 550 nm."""
+    start: Coordinates
+
+    ABSORBED = 0.1
+    LIMITS = ((-Log.REACH, -4.0, 0.0), (Log.REACH, 6.0, 1 / ABSORBED))
+
+    @classmethod
+    def build(cls, init: Atmosphere, absorption: bool) -> "Aerosol":
+        """Start from the power law nearest to the aerosol of ``init``; ``absorption`` says whether the last is free."""
+        ratio = init.wavelengths / REFERENCE_NM
+        if not bool(jnp.all(init.mie_extinction > 0)):
+            raise FitError(f"tie: {MIE} = {ANGSTROM!r} needs an aerosol to start from, but the start has none")
+        depth, x = np.log(np.asarray(init.mie_extinction, float)), np.log(np.asarray(ratio, float))
+        slope, level = np.polyfit(x, depth, 1) if x.size > 1 else (0.0, depth.mean())
+        absorbed = safe_divide(init.mie_absorption, init.mie_extinction)
+        alpha = float(np.clip(-slope, cls.LIMITS[0][1], cls.LIMITS[1][1]))
+        start = [0.0, alpha, *[float(absorbed.mean()) / cls.ABSORBED] * absorption]
+        dtype = init.mie_extinction.dtype
+        return cls(
+            extinction=jnp.asarray(np.exp(level), dtype),
+            absorbed=None if absorption else absorbed,
+            ratio=ratio,
+            start=jnp.asarray(start, dtype),
+        )
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """See :class:`Block`."""
+        return "mie_scattering", "mie_absorption"
+
+    @property
+    def spectral(self) -> bool:
+        """See :class:`Block`."""
+        return False
+
+    @property
+    def limits(self) -> tuple[Coordinates, Coordinates]:
+        """See :class:`Block`."""
+        lower, upper = (jnp.asarray(limit[: self.start.size], self.start.dtype) for limit in self.LIMITS)
+        return lower, upper
+
+    def values(self, y):
+        """See :class:`Block`."""
+        extinction = self.extinction * jnp.exp(y[0]) * self.ratio ** -y[1]
+        absorbed = jnp.clip(self.ABSORBED * y[2], 0, 1) if self.absorbed is None else self.absorbed
+        return [extinction * (1 - absorbed), extinction * absorbed]
+
+    def held(self, y):
+        """See :class:`Block`."""
+        lower, upper = (np.asarray(limit) for limit in self.limits)
+        outside = (y <= lower) | (y >= upper)
+        both = np.any(outside[:2], keepdims=True)
+        return [both, both | outside[2:].any()]
 
 
 class Parameters(eqx.Module):
@@ -158,6 +196,8 @@ class Parameters(eqx.Module):
 
     init: Atmosphere
     blocks: tuple[Block, ...]
+    tied: tuple[str, ...] = eqx.field(static=True, default=())
+    """Derived quantities that have a meaning because of a tie."""
 
     @property
     def size(self) -> int:
@@ -165,34 +205,50 @@ class Parameters(eqx.Module):
         return sum(block.start.size for block in self.blocks)
 
     @property
-    def start(self) -> Coordinates:
-        """Coordinates of ``init``."""
-        return jnp.concatenate([block.start for block in self.blocks])
+    def fields(self) -> list[str]:
+        """The free fields, in the order of the blocks."""
+        return [field for block in self.blocks for field in block.fields]
 
     @property
-    def _cuts(self) -> Int[np.ndarray, " b"]:
-        """Where the coordinates of one block end and those of the next begin."""
-        return np.cumsum([block.start.size for block in self.blocks])[:-1]
+    def derived(self) -> list[str]:
+        """The derived quantities that are worth a line in the result."""
+        return derived_fields(self.fields, (*ALWAYS, *self.tied))
+
+    @property
+    def start(self) -> Coordinates:
+        """Coordinates of the start: those of ``init``, or of what is nearest to it under the ties."""
+        return jnp.concatenate([block.start for block in self.blocks])
+
+    def _split(self, y: Any) -> list[Any]:
+        """The coordinates of each block."""
+        ends = np.cumsum([block.start.size for block in self.blocks])
+        return [y[end - block.start.size : end] for block, end in zip(self.blocks, ends, strict=True)]
 
     def atmosphere(self, y: Coordinates) -> Atmosphere:
         """The atmosphere at coordinates ``y``."""
-        values = [block.value(part) for block, part in zip(self.blocks, jnp.split(y, self._cuts), strict=True)]
-        return eqx.tree_at(lambda a: [getattr(a, block.field) for block in self.blocks], self.init, values)
+        values: dict[str, Array] = {}
+        for block, part in zip(self.blocks, self._split(y), strict=True):
+            values |= dict(zip(block.fields, block.values(part), strict=True))
+        for coefficient, height in _COLUMNS:
+            if coefficient in values and height in values:
+                values[coefficient] *= getattr(self.init, height) / values[height]
+        return eqx.tree_at(lambda a: [getattr(a, field) for field in values], self.init, list(values.values()))
 
     @property
     def limits(self) -> tuple[Coordinates, Coordinates]:
         """The smallest and the largest coordinates."""
-        lower, upper = zip(*(block.bijection.limits for block in self.blocks), strict=True)
+        lower, upper = zip(*(block.limits for block in self.blocks), strict=True)
         return jnp.concatenate(lower), jnp.concatenate(upper)
 
     def at_bound(self, y: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " q"]:
-        """Whether each number of the free fields is at its bound, in the order of :func:`quantities`."""
-        result = []
-        for block, part in zip(self.blocks, np.split(y, self._cuts), strict=True):
-            lower, upper = (np.asarray(limit) for limit in block.bijection.limits)
-            outside = (part <= lower) | (part >= upper)
-            result.append(np.broadcast_to(outside, jnp.size(getattr(self.init, block.field))))
-        return np.concatenate(result)
+        """Whether each number of the free fields is at its bound, in the order of ``quantities(fields, …)``."""
+        return np.concatenate(
+            [
+                np.broadcast_to(held, jnp.size(getattr(self.init, field)))
+                for block, part in zip(self.blocks, self._split(y), strict=True)
+                for field, held in zip(block.fields, block.held(part), strict=True)
+            ]
+        )
 
     def colours(self) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"]]:
         """The colouring of the Jacobian: for each coordinate the tangent it shares, and the one channel it touches.
@@ -200,28 +256,25 @@ class Parameters(eqx.Module):
         Wavelengths do not mix in any model, so channel w of an image depends on number w of a spectral field only: all
         wavelengths of a field share one tangent. A coordinate that touches every channel has channel -1.
         """
-        colour, channel = [], []
-        for number, block in enumerate(self.blocks):
-            colour += [number] * block.start.size
-            channel += list(range(block.start.size)) if block.spectral else [-1]
+        colour: list[int] = []
+        channel: list[int] = []
+        for block in self.blocks:
+            count, following = block.start.size, max(colour, default=-1) + 1
+            colour += [following] * count if block.spectral else list(range(following, following + count))
+            channel += list(range(count)) if block.spectral else [-1] * count
         return np.array(colour), np.array(channel)
 
 
-def spectral_name(name: str, wavelength: float) -> str:
-    """Name of one wavelength's number."""
-    return f"{name}_{wavelength:g}"
-
-
-_Choice: TypeAlias = Callable[[Atmosphere, Array], Bijection]
-"""The bijection of a field, from the atmosphere at the start and the field's value in it."""
+_Choice: TypeAlias = Callable[[Atmosphere, Array, Array], Bijection]
+"""The bijection of a value: from the atmosphere at the start, the start value, and one over the unit it is given in."""
 
 
 def _positive(typical: float) -> _Choice:
     """Log around the start value; a field with a zero in it is linear instead, to be able to leave it."""
     linear = _maybe_zero(typical)
 
-    def choose(init: Atmosphere, value: Array) -> Bijection:
-        return Log(jnp.zeros_like(value), value) if bool(jnp.all(value > 0)) else linear(init, value)
+    def choose(init: Atmosphere, value: Array, per_unit: Array) -> Bijection:
+        return Log(jnp.zeros_like(value), value) if bool(jnp.all(value > 0)) else linear(init, value, per_unit)
 
     return choose
 
@@ -229,24 +282,27 @@ def _positive(typical: float) -> _Choice:
 def _maybe_zero(typical: float, upper: float = jnp.inf) -> _Choice:
     """Linear, in units of the largest start value, or of the ``typical`` one if the start is zero."""
 
-    def choose(init: Atmosphere, value: Array) -> Bijection:
+    def choose(init: Atmosphere, value: Array, per_unit: Array) -> Bijection:
         del init
         largest = float(jnp.max(value))
-        return Linear(jnp.full_like(value, largest if largest > 0 else typical), jnp.full_like(value, upper))
+        unit = jnp.full_like(value, largest) if largest > 0 else jnp.full_like(value, typical) / per_unit
+        # Where there is a shape, a little below the bound, because its product with the factor is rounded.
+        bound = jnp.full_like(value, upper) / per_unit
+        return Linear(unit, jnp.where(per_unit == 1, bound, (1 - 1e-6) * bound))
 
     return choose
 
 
 _CHOICES: dict[str, _Choice] = {
     "solar_irradiance": _positive(1.0),
-    "bottom_radius": lambda init, value: Logit(jnp.zeros_like(value), init.top_radius[None]),
-    "top_radius": lambda init, value: Log(init.bottom_radius[None], init.top_altitude[None]),
+    "bottom_radius": lambda init, value, _: Logit(jnp.zeros_like(value), init.top_radius[None]),
+    "top_radius": lambda init, value, _: Log(init.bottom_radius[None], init.top_altitude[None]),
     "rayleigh_scattering": _positive(1e-2),
     "rayleigh_scale_height": _positive(8.0),
     "mie_scattering": _positive(4e-3),
     "mie_absorption": _maybe_zero(4e-4),
     "mie_scale_height": _positive(1.2),
-    "mie_g": lambda init, value: Logit(-jnp.ones_like(value), jnp.ones_like(value)),
+    "mie_g": lambda init, value, _: Logit(-jnp.ones_like(value), jnp.ones_like(value)),
     "ozone_absorption": _maybe_zero(1e-3),
     "ground_albedo": _maybe_zero(0.3, upper=1.0),
     "ozone_center_altitude": _positive(25.0),
@@ -258,63 +314,19 @@ FREE_FIELDS = tuple(_CHOICES)
 """Names of the fields that can be free."""
 
 
-def _unit(field: str) -> str:
-    suffix = FILE_KEYS.get(field, field).removeprefix(field)
-    return {"_km": "km", "_per_km": "1/km", "_nm": "nm", "": ""}[suffix]
-
-
-def quantities(fields: Sequence[str], wavelengths: Sequence[float]) -> list[Quantity]:
-    """What each number of ``fields`` is, in order; spectral fields have one number per wavelength."""
-    result = []
-    for field in fields:
-        if field in SPECTRAL or field in DERIVED:
-            result += [Quantity(spectral_name(field, nm), field, nm, _unit(field)) for nm in wavelengths]
-        else:
-            result.append(Quantity(field, field, None, _unit(field)))
-    return result
-
-
-DERIVED: dict[str, tuple[Callable[[Atmosphere], Float[Array, " w"]], tuple[str, ...]]] = {
-    "rayleigh_optical_depth": (
-        lambda a: a.rayleigh_optical_depth,
-        ("rayleigh_scattering", "rayleigh_scale_height"),
-    ),
-    "mie_optical_depth": (
-        lambda a: a.mie_optical_depth,
-        ("mie_scattering", "mie_absorption", "mie_scale_height"),
-    ),
-    "mie_single_scattering_albedo": (
-        lambda a: safe_divide(a.mie_scattering, a.mie_extinction),
-        ("mie_scattering", "mie_absorption"),
-    ),
-}
-"""Combinations that images determine better than their factors: name -> (function, the fields it depends on)."""
-
-
-def derived_fields(free: Sequence[str]) -> list[str]:
-    """The derived quantities that vary when the fields ``free`` do."""
-    return [name for name, (_, ingredients) in DERIVED.items() if set(ingredients) & set(free)]
-
-
-def numbers(atmosphere: Atmosphere, fields: Sequence[str]) -> Float[Array, " q"]:
-    """The numbers of ``fields``, derived ones included, in the order of :func:`quantities`."""
-    values = [DERIVED[name][0](atmosphere) if name in DERIVED else getattr(atmosphere, name) for name in fields]
-    return jnp.concatenate([jnp.atleast_1d(value) for value in values])
-
-
 def _unknown(name: Any, allowed: Sequence[str]) -> str:
     close = difflib.get_close_matches(str(name), allowed, n=1)
     hint = f"; did you mean {close[0]!r}?" if close else ""
     return f"{name!r} cannot be free{hint} (possible: {', '.join(allowed)})"
 
 
-def select(init: Atmosphere, free: Sequence[str], scaled: Sequence[str] = ()) -> Parameters:
+def select(init: Atmosphere, free: Sequence[str], tie: Mapping[str, str] | None = None) -> Parameters:
     """Make the fields ``free`` of ``init`` free.
 
-    A spectral field is free at every wavelength, or, if it is in ``scaled`` as well, by one factor that keeps the
-    ratios of ``init``. Raises :class:`FitError` for a name that cannot be free.
+    A spectral field is free at every wavelength, unless ``tie`` says how its numbers hang together (see the head of this
+    module). Raises :class:`FitError` for a name that cannot be free, or a tie that cannot be.
     """
-    if isinstance(free, str) or isinstance(scaled, str):
+    if isinstance(free, str):
         raise FitError("free: got one string, expected a list of names")
     for name in free:
         if name not in _CHOICES:
@@ -328,24 +340,66 @@ def select(init: Atmosphere, free: Sequence[str], scaled: Sequence[str] = ()) ->
         raise FitError("free: bottom_radius and top_radius bound each other; free only one of them")
     if "mie_g" in free and isinstance(init.mie_phase, PhaseTable):
         raise FitError("free: 'mie_g' means nothing to an aerosol with a tabulated phase function")
-    for name in scaled:
-        if name not in free:
-            raise FitError(f"scaled: {name!r} is not among the free parameters ({', '.join(free)})")
-        if name not in SPECTRAL:
-            raise FitError(f"scaled: {name!r} has no wavelengths to scale together")
-    return Parameters(init, tuple(_block(init, name, name in scaled) for name in free))
+    ties = dict(tie or {})
+    _check_ties(ties, free)
+    blocks: list[Block] = []
+    for name in free:
+        if ties.get(MIE) == ANGSTROM and name in ("mie_scattering", "mie_absorption"):
+            if name == "mie_scattering":
+                blocks.append(Aerosol.build(init, "mie_absorption" in free))
+        else:
+            blocks.append(_single(init, name, ties.get(name)))
+    tied = ["ozone_column"] * (DOBSON in ties.values())
+    if ANGSTROM in ties.values():
+        at_reference = bool(np.any(np.isclose(np.asarray(init.wavelengths), REFERENCE_NM)))
+        tied += ["mie_angstrom_exponent", *[f"mie_optical_depth_{REFERENCE_NM:g}"] * (not at_reference)]
+    return Parameters(init, tuple(blocks), tuple(tied))
 
 
-def _block(init: Atmosphere, field: str, scaled: bool) -> Block:
+def _check_ties(tie: dict[str, str], free: Sequence[str]) -> None:
+    """Refuse ties that cannot be."""
+    for name, kind in tie.items():
+        if kind not in TIES:
+            raise FitError(f"tie: {name} = {kind!r} is unknown; ties are {', '.join(TIES)}")
+        if name not in TIES[kind]:
+            raise FitError(f"tie: {name} cannot be {kind!r}, which is for {', '.join(TIES[kind])}")
+        if name != MIE and name not in free:
+            raise FitError(f"tie: {name!r} is not among the free parameters ({', '.join(free)})")
+    if tie.get(MIE) == ANGSTROM:
+        if "mie_scattering" not in free:
+            raise FitError(f"tie: {MIE} = {ANGSTROM!r} needs mie_scattering among the free parameters")
+        for name in ("mie_scattering", "mie_absorption"):
+            if name in tie:
+                raise FitError(f"tie: {name} is tied by {MIE} = {ANGSTROM!r} already; leave out the other tie")
+
+
+def _single(init: Atmosphere, field: str, tie: str | None) -> Single:
     value = jnp.atleast_1d(getattr(init, field))
-    if not scaled:
-        bijection = _CHOICES[field](init, value)
-        lower, upper = bijection.limits
-        return Block(field, bijection, jnp.clip(bijection.coordinate(value), lower, upper), None)
-    largest = jnp.max(value)
-    if largest == 0:
-        raise FitError(f"scaled: {field!r} starts at zero at every wavelength, so no factor can change it")
-    one = jnp.ones_like(value, shape=(1,))
-    # A little below one, because the product of factor and ratio is rounded.
-    upper = (1 - 1e-6) * one / largest if field == "ground_albedo" else jnp.inf * one
-    return Block(field, Linear(one, upper), one, value)
+    shape = None
+    if tie is not None:
+        shape = _shape(init, field, tie)
+        value = (jnp.sum(value) / jnp.sum(shape))[None]
+    per_unit = jnp.ones(1, value.dtype) if shape is None else jnp.max(shape)[None]
+    bijection = _CHOICES[field](init, value, per_unit)
+    lower, upper = bijection.limits
+    start = jnp.clip(bijection.coordinate(value), lower, upper)
+    return Single(field=field, bijection=bijection, start=start, shape=shape)
+
+
+def _shape(init: Atmosphere, field: str, tie: str) -> Float[Array, " w"]:
+    """The spectrum of a tied field, in the unit of its factor."""
+    value = getattr(init, field)
+    if tie == START:
+        if not bool(jnp.any(value > 0)):
+            raise FitError(
+                f"tie: {field} = {START!r}: it starts at zero at every wavelength, so no factor can change it"
+            )
+        return value
+    if tie == LAMBDA_4:
+        return (init.wavelengths / REFERENCE_NM) ** -4
+    if tie == DOBSON:
+        try:
+            return spectrum.ozone_absorption(init.wavelengths, column_du=1.0, half_width=init.ozone_half_width)
+        except ValueError as error:
+            raise FitError(f"tie: {field} = {DOBSON!r}: {error}") from error
+    return jnp.ones_like(value)

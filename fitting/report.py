@@ -24,7 +24,7 @@
 ``derived``           the same for optical depths and single scattering albedo
 ``exposures``         the same for the free exposure factors
 ``undetermined``      names of the numbers that the images do not determine
-``covariance``        ``names`` and ``matrix`` (of all fitted numbers), ``correlation`` likewise
+``covariance``        ``names`` and ``matrix`` (of all numbers above), ``correlation`` likewise
 ``images``            for each: place, sun, exposure, masked pixels by reason, and ``residuals``: per wavelength the
                       median and the root mean square of measured / fitted - 1, and the root mean square in sigmas
 ``timings``           seconds: ``compile_s``, ``solve_s``, ``total_s``
@@ -448,9 +448,16 @@ def convergence_figure(result: FitResult) -> Figure:
     return figure
 
 
+def fitted_correlation(result: FitResult) -> tuple[list[str], Float[np.ndarray, "n n"]]:
+    """Names and correlation matrix of the fitted numbers, without those that follow from them."""
+    derived = {estimate.name for estimate in result.parameters if estimate.derived}
+    kept = [number for number, name in enumerate(result.covariance_names) if name not in derived]
+    return [result.covariance_names[number] for number in kept], result.correlation[np.ix_(kept, kept)]
+
+
 def correlation_figure(result: FitResult) -> Figure:
-    """Correlation matrix of all fitted numbers."""
-    names, matrix = result.covariance_names, result.correlation
+    """Correlation matrix of the fitted numbers."""
+    names, matrix = fitted_correlation(result)
     size = 2.6 + 0.2 * len(names)
     figure = Figure(figsize=(size + 0.6, size), layout="constrained")
     axes = figure.subplots()
@@ -568,9 +575,10 @@ def _notes(result: FitResult) -> list[str]:
             f"The residuals are {result.error_scale:.1f} times as large as the stated noise, and so are the standard "
             "errors. If the noise is right, the model does not describe the images as precisely as it should."
         )
-    matrix = np.abs(np.nan_to_num(result.correlation))
+    names, signed = fitted_correlation(result)
+    matrix = np.abs(np.nan_to_num(signed))
     pairs = [
-        (matrix[i, j], result.covariance_names[i], result.covariance_names[j])
+        (matrix[i, j], names[i], names[j])
         for i in range(len(matrix))
         for j in range(i)
         # Numbers that share one factor are one number.

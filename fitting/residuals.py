@@ -65,7 +65,7 @@ class Problem(eqx.Module):
 
 def planet_shell(model: Model, parameters: Parameters) -> Any:
     """The geometry that ``model`` would else compute in each step; None if there is none or the planet is free."""
-    if not isinstance(model, Moments) or {"bottom_radius", "top_radius"} & {b.field for b in parameters.blocks}:
+    if not isinstance(model, Moments) or {"bottom_radius", "top_radius"} & set(parameters.fields):
         return None
     init = parameters.init
     return model.shell(bottom_radius=init.bottom_radius, top_altitude=init.top_altitude)

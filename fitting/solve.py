@@ -21,7 +21,7 @@ from the fitted one.
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -410,7 +410,7 @@ def solve(
     *,
     init: Atmosphere,
     free: Sequence[str],
-    scaled: Sequence[str] = (),
+    tie: Mapping[str, str] | None = None,
     model: Model,
     progress: Progress | None = None,
     max_steps: int = MAX_STEPS,
@@ -427,7 +427,7 @@ def solve(
     if not tolerance > 0:
         raise FitError(f"tolerance: got {tolerance}, expected a number > 0")
     started = time.perf_counter()
-    parameters = select(init, free, scaled)
+    parameters = select(init, free, tie)
     wavelengths = [float(nm) for nm in init.wavelengths]
     batch = stack(observations, wavelengths)
     names, _ = exposures(observations, wavelengths)

@@ -17,8 +17,9 @@ and neither leaves room for more confidence.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -26,10 +27,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from diffatmo.atmosphere import Atmosphere
+from diffatmo.compiling import outermost
 from diffatmo.models import Model, Moments
 from fitting._errors import FitError
 from fitting.observation import Observation, sigma, unstack
-from fitting.parameters import Coordinates, derived_fields, numbers, quantities
+from fitting.parameters import Coordinates, Parameters
+from fitting.quantities import numbers, quantities
 from fitting.solve import MAX_STEPS, RANK_TOLERANCE, TOLERANCE, Progress, Solution, Step, solve
 
 
@@ -162,29 +165,37 @@ def propagate(
     return covariance, determined
 
 
+def _physical(
+    y: Coordinates, parameters: Parameters
+) -> tuple[Float[Array, " q"], tuple[Float[Array, " q"], Atmosphere]]:
+    """The numbers that are reported, once to be differentiated and once for themselves, and the atmosphere."""
+    atmosphere = parameters.atmosphere(y[: parameters.size])
+    found = numbers(atmosphere, [*parameters.fields, *parameters.derived])
+    values = jnp.concatenate([found, jnp.exp(y[parameters.size :])])
+    return values, (values, atmosphere)
+
+
+def _slopes(y: Coordinates, parameters: Parameters) -> Any:
+    return jax.jacfwd(_physical, has_aux=True)(y, parameters)
+
+
 def summarise(solution: Solution, observations: Sequence[Observation]) -> FitResult:
     """Attach error bars to ``solution``."""
     parameters = solution.parameters
     count = parameters.size
     wavelengths = [float(nm) for nm in parameters.init.wavelengths]
-    free = [block.field for block in parameters.blocks]
-    derived = derived_fields(free)
+    free, derived = parameters.fields, parameters.derived
     fitted_quantities = quantities(free, wavelengths)
     all_quantities = fitted_quantities + quantities(derived, wavelengths)
 
-    def physical(y: Coordinates) -> tuple[Float[Array, " q"], tuple[Float[Array, " q"], Atmosphere]]:
-        atmosphere = parameters.atmosphere(y[:count])
-        values = jnp.concatenate([numbers(atmosphere, free + derived), jnp.exp(y[count:])])
-        return values, (values, atmosphere)
-
-    slopes, (numbers_found, atmosphere) = jax.jit(jax.jacfwd(physical, has_aux=True))(solution.y)
+    slopes, (numbers_found, atmosphere) = outermost(_slopes)(solution.y, parameters)
     values, gradient = np.asarray(numbers_found, dtype=float), np.asarray(slopes, dtype=float)
     covariance, determined = propagate(solution.triangle[:-1, :-1], gradient)
     reduced_chi2 = solution.chi2 / max(solution.degrees_of_freedom, 1)
     scale = max(1.0, math.sqrt(reduced_chi2))
     covariance = scale**2 * covariance + gradient @ solution.model_error @ gradient.T
     errors = [math.sqrt(v) if ok else None for v, ok in zip(np.diag(covariance), determined, strict=True)]
-    initial = np.asarray(numbers(parameters.init, free + derived), dtype=float)
+    initial = np.asarray(numbers(parameters.atmosphere(parameters.start), free + derived), dtype=float)
     at_bound = parameters.at_bound(np.asarray(solution.y)[:count])
 
     estimates = [
@@ -205,13 +216,12 @@ def summarise(solution: Solution, observations: Sequence[Observation]) -> FitRes
         Estimate(name, name, None, "", values[i], errors[i], None)
         for i, name in enumerate(solution.exposure_names, start=len(all_quantities))
     ]
-    reported = [*range(len(fitted_quantities)), *range(len(all_quantities), len(values))]
     return FitResult(
         atmosphere=atmosphere,
         parameters=estimates,
         exposures=factors,
-        covariance=covariance[np.ix_(reported, reported)],
-        covariance_names=[quantity.name for quantity in fitted_quantities] + solution.exposure_names,
+        covariance=covariance,
+        covariance_names=[estimate.name for estimate in [*estimates, *factors]],
         chi2=solution.chi2,
         degrees_of_freedom=solution.degrees_of_freedom,
         error_scale=scale,
@@ -231,7 +241,7 @@ def fit(
     *,
     init: Atmosphere,
     free: Sequence[str],
-    scaled: Sequence[str] = (),
+    tie: Mapping[str, str] | None = None,
     model: Model | None = None,
     progress: Progress | None = None,
     max_steps: int = MAX_STEPS,
@@ -245,7 +255,9 @@ def fit(
         init: Where the search starts, and the value of everything that is not free.
         free: Names of the fields of :class:`~diffatmo.atmosphere.Atmosphere` to recover; a spectral field is free at
             every wavelength.
-        scaled: Those of the spectral ones of which only a common factor is free.
+        tie: How the wavelengths of a spectral field hang together, name -> kind: ``start`` (a common factor times the
+            values of ``init``), ``grey``, ``lambda^-4`` (of ``rayleigh_scattering``), ``dobson`` (of ``ozone_absorption``), or
+            ``{"mie": "angstrom"}``; see :mod:`fitting.parameters`.
         model: How the sky is computed, :class:`~diffatmo.models.moments.Moments` by default.
         progress: Called after each step.
         max_steps: Evaluations of the model with its derivatives before the fit gives up.
@@ -264,7 +276,7 @@ def fit(
         observations,
         init=init,
         free=free,
-        scaled=scaled,
+        tie=tie,
         model=Moments() if model is None else model,
         progress=progress,
         max_steps=max_steps,

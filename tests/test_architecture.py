@@ -38,6 +38,7 @@ LEVELS = [
     ["diffatmo.render", "diffatmo.imageio"],
     ["diffatmo.scene", "diffatmo.comparison", "diffatmo.export"],
     ["fitting._errors"],
+    ["fitting.bijections", "fitting.quantities"],
     ["fitting.parameters", "fitting.observation"],
     ["fitting.residuals"],
     ["fitting.solve"],

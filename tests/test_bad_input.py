@@ -202,7 +202,11 @@ CASES = {
     "unknown parameter": (["fit", "GOOD.exr", "--free", "mie_gg"], "did you mean 'mie_g'"),
     "nothing free": (["fit", "GOOD.exr", "--free", ""], "free"),
     "parameter given twice": (["fit", "GOOD.exr", "--free", "mie_g,mie_g"], "mie_g"),
-    "scaled but not free": (["fit", "GOOD.exr", "--free", "mie_g", "--scaled", "mie_scattering"], "scaled"),
+    "tied but not free": (
+        ["fit", "GOOD.exr", "--free", "mie_g", "--tie", "mie_scattering=grey"],
+        "tie: 'mie_scattering'",
+    ),
+    "tie of no kind": (["fit", "GOOD.exr", "--free", "mie_g", "--tie", "mie_scattering"], "--tie"),
     "sun given twice": (["fit", "GOOD.exr", "--sun", "detect", "--sun-zenith-deg", "40"], "contradicts"),
     "image and scene": (["fit", "GOOD.exr", "--config", "NOISE.scene"], "contradict"),
     "option without image": (["fit", "--noise", "0.1"], "--noise"),

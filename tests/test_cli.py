@@ -259,7 +259,7 @@ def test_fit_of_a_scene_file(tmp_path, s1, start, toy):
         pixels, _, _ = scene.load(folder / f"with_{z}.exr")
         imageio.write_exr(folder / f"bare_{z}.exr", 2 * pixels)
     (folder / "scene.toml").write_text(
-        'init = "start.toml"\nfree = ["rayleigh_scattering", "mie_g"]\nscaled = ["rayleigh_scattering"]\n'
+        'init = "start.toml"\nfree = ["rayleigh_scattering", "mie_g"]\ntie = { rayleigh_scattering = "start" }\n'
         + "".join(
             f'[[image]]\nfile = "bare_{z}.exr"\nprojection = "equirectangular"\naltitude_km = 0.1\n'
             f"sun_zenith_deg = {z}.0\nsun_azimuth_deg = {math.degrees(0.3)}\n"
@@ -381,7 +381,7 @@ def test_files_in_the_readme_can_be_read(tmp_path):
     spec = read_scene(tmp_path / "scene.toml")
     assert spec.init == str(tmp_path / "start.toml")
     assert spec.images[0].file == tmp_path / "sky_40.exr"
-    assert set(spec.scaled) <= set(spec.free)
+    assert set(spec.tie) <= set(spec.free)
 
 
 def test_a_fault_of_ours_keeps_its_traceback(tmp_path, atm, monkeypatch):

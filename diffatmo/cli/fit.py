@@ -31,7 +31,11 @@ PLAIN_WIDTH = 120
     "--init", metavar="ATM.toml", help="Where the fit starts: an atmosphere file or a preset.  [default: earth]"
 )
 @click.option("--free", metavar="NAME,...", help=f"Parameters to recover.  [default: {', '.join(FREE)}]")
-@click.option("--scaled", metavar="NAME,...", help="Those of them that keep the ratios they start with.")
+@click.option(
+    "--tie",
+    metavar="NAME=TIE,...",
+    help="How wavelengths hang together: start (keep the ratios of the start), grey, lambda^-4, dobson, mie=angstrom.",
+)
 @click.option("--model", type=click.Choice(MODELS), help="How the sky is computed.  [default: moments]")
 @click.option("--max-steps", type=click.IntRange(min=1), help="Steps before the fit gives up.  [default: 100]")
 @keys.options(IMAGE_KEYS)
@@ -50,7 +54,7 @@ def fit(
     config: Path | None,
     init: str | None,
     free: str | None,
-    scaled: str | None,
+    tie: str | None,
     model: str | None,
     max_steps: int | None,
     output: Path,
@@ -64,7 +68,7 @@ def fit(
 
     Writes fit.json, atmosphere.toml, pictures of images, fits and residuals, and report.html.
     """
-    override = {"init": init, "free": _names(free), "scaled": _names(scaled), "model": model, "max_steps": max_steps}
+    override = {"init": init, "free": _names(free), "tie": _ties(tie), "model": model, "max_steps": max_steps}
     specs = plan(images, config, keys.given(IMAGE_KEYS, values), output)
     # All that can be wrong is found before the first fit, which is written as soon as it is done.
     jobs = {directory: prepare(spec.override(**override)) for directory, spec in specs.items()}
@@ -99,7 +103,7 @@ class Job:
     init: "Atmosphere"
     truth: "Atmosphere | None"
     free: tuple[str, ...]
-    scaled: tuple[str, ...]
+    tie: Mapping[str, str]
     model: str
     refine: bool
     max_steps: int
@@ -111,8 +115,8 @@ def prepare(spec: FitSpec) -> Job:
     from fitting.parameters import select
 
     init = read_atmosphere(spec.init or "earth")
-    free, scaled = spec.free if spec.free is not None else FREE, spec.scaled or ()
-    select(init, free, scaled)
+    free, tie = spec.free if spec.free is not None else FREE, spec.tie or {}
+    select(init, free, tie)
     seen = [observe(image, name, init) for image, name in zip(spec.images, image_names(spec.images), strict=True)]
     # Images of different atmospheres have no truth in common.
     truths = {dumps(truth): truth for truth in (image.truth for image in seen) if truth is not None}
@@ -122,7 +126,7 @@ def prepare(spec: FitSpec) -> Job:
         init=init,
         truth=next(iter(truths.values())) if len(truths) == 1 else None,
         free=tuple(free),
-        scaled=tuple(scaled),
+        tie=tie,
         model=model,
         # A finer model would correct what is not wrong in images that the model itself has made.
         refine=any(image.model != model for image in seen),
@@ -167,7 +171,7 @@ def run(job: Job, directory: Path, *, overwrite: bool) -> bool:
             job.observations,
             init=job.init,
             free=job.free,
-            scaled=job.scaled,
+            tie=job.tie,
             model=Bruneton.reduced() if job.model == "bruneton" else make_model(job.model),
             progress=show,
             max_steps=job.max_steps,
@@ -181,3 +185,14 @@ def run(job: Job, directory: Path, *, overwrite: bool) -> bool:
 
 def _names(text: str | None) -> tuple[str, ...] | None:
     return None if text is None else tuple(name.strip() for name in text.split(",") if name.strip())
+
+
+def _ties(text: str | None) -> dict[str, str] | None:
+    """``NAME=TIE,NAME=TIE`` as a mapping."""
+    if text is None:
+        return None
+    pairs = [item.partition("=") for item in _names(text) or ()]
+    for name, sign, kind in pairs:
+        if not sign or not name or not kind:
+            raise InputError(f"--tie: got {text!r}, expected NAME=TIE,... like mie=angstrom,ground_albedo=grey")
+    return {name.strip(): kind.strip() for name, _, kind in pairs}

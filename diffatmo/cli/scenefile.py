@@ -48,7 +48,7 @@ IMAGE_KEYS: dict[str, Key] = {
 MODELS = ("moments", "bruneton", "hillaire", "raymarch")
 """The models that have derivatives."""
 
-SCENE_KEYS = ("init", "free", "scaled", "model", "max_steps", "image")
+SCENE_KEYS = ("init", "free", "tie", "model", "max_steps", "image")
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class FitSpec:
     images: tuple[ImageSpec, ...]
     init: str | None = None
     free: tuple[str, ...] | None = None
-    scaled: tuple[str, ...] | None = None
+    tie: Mapping[str, str] | None = None
     model: str | None = None
     max_steps: int | None = None
 
@@ -119,7 +119,7 @@ def _scene(data: Mapping[str, Any], directory: Path) -> FitSpec:
     max_steps = data.get("max_steps")
     if max_steps is not None and (isinstance(max_steps, bool) or not isinstance(max_steps, int) or max_steps < 1):
         raise InputError(f"max_steps: got {max_steps!r}, expected a whole number of at least 1")
-    return FitSpec(tuple(images), init, _names(data, "free"), _names(data, "scaled"), model, max_steps)
+    return FitSpec(tuple(images), init, _names(data, "free"), _tie(data.get("tie")), model, max_steps)
 
 
 def _image(table: Mapping[str, Any], directory: Path) -> ImageSpec:
@@ -141,6 +141,12 @@ def _names(data: Mapping[str, Any], key: str) -> tuple[str, ...] | None:
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise InputError(f"{key}: got {names!r}, expected a list of parameter names")
     return tuple(names)
+
+
+def _tie(tie: Any) -> dict[str, str] | None:
+    if tie is not None and not (isinstance(tie, dict) and all(isinstance(kind, str) for kind in tie.values())):
+        raise InputError(f'tie: got {tie!r}, expected a table like {{ mie = "angstrom", ground_albedo = "grey" }}')
+    return tie
 
 
 def _refuse_unknown(table: Mapping[str, Any], known: tuple[str, ...]) -> None:

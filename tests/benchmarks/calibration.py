@@ -41,7 +41,7 @@ def realisation(means: list[tuple[np.ndarray, np.ndarray]], truth, seed: int) ->
             )
         )
     # Where the search starts does not matter to where it ends, only to how long it takes.
-    return fitting.fit(observations, init=truth, free=generate.FREE, scaled=generate.SCALED).with_truth(truth)
+    return fitting.fit(observations, init=truth, free=generate.FREE, tie=generate.TIE).with_truth(truth)
 
 
 def main(count: int, names: list[str]) -> None:
