@@ -9,9 +9,11 @@
 
 from fitting import report
 from fitting._errors import FitError
+from fitting.findings import Estimate
 from fitting.observation import Observation, observe
 from fitting.parameters import FREE_FIELDS
+from fitting.result import FitResult
 from fitting.solve import Step
-from fitting.uncertainty import Estimate, FitResult, fit
+from fitting.uncertainty import fit
 
 __all__ = ["FREE_FIELDS", "Estimate", "FitError", "FitResult", "Observation", "Step", "fit", "observe", "report"]

@@ -40,37 +40,37 @@ import re
 from collections.abc import Callable, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax.numpy as jnp
-import matplotlib
 import numpy as np
 from jaxtyping import Float
-from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
-from rich.box import SIMPLE_HEAD
-from rich.table import Table
-from rich.text import Text
 
-from diffatmo import atmosphere, color, folders, imageio, scene, sun
+from diffatmo import atmosphere, folders, imageio, scene, sun
 from diffatmo.atmosphere import Atmosphere
 from diffatmo.render import Scene
 from fitting._errors import FitError
+from fitting.figures import (
+    Image,
+    convergence_figure,
+    correlation_figure,
+    developed,
+    diverging,
+    histogram_figure,
+    image_figure,
+    residual_scale,
+)
+from fitting.findings import Estimate, Findings
 from fitting.observation import PER_CHANNEL, Observation, exposure_name
-from fitting.uncertainty import Estimate, FitResult
+from fitting.tables import notes, page_table, table, verdict
+
+__all__ = ["STYLE", "check_writable", "figure_tag", "file_names", "page", "record", "scene_of", "table", "write"]
 
 SCHEMA, SCHEMA_VERSION = "diffatmo-fit", 1
 
 FIXED_NAMES = ("fit.json", "atmosphere.toml", "report.html")
 IMAGE_PREFIXES = ("fitted_", "residual_")
-
-FAR = 3.0
-"""Standard errors from the truth beyond which an estimate is marked."""
-
-Image = Float[np.ndarray, "height width w"]
 
 
 def check_writable(directory: str | Path, *, overwrite: bool = False) -> Path:
@@ -87,7 +87,7 @@ def check_writable(directory: str | Path, *, overwrite: bool = False) -> Path:
 
 
 def write(
-    result: FitResult, directory: str | Path, *, truth: Atmosphere | None = None, overwrite: bool = False
+    result: Findings, directory: str | Path, *, truth: Atmosphere | None = None, overwrite: bool = False
 ) -> list[Path]:
     """Write all files of the report and return their paths.
 
@@ -138,7 +138,7 @@ def write(
     return [path / file for file in tasks]
 
 
-def scene_of(result: FitResult, observation: Observation) -> Scene | None:
+def scene_of(result: Findings, observation: Observation) -> Scene | None:
     """The scene of a fitted image; None if its pixels are not the camera's, or have an exposure for each channel."""
     if observation.block > 1 or observation.exposure.endswith(PER_CHANNEL):
         return None
@@ -195,7 +195,7 @@ def _by_field(estimates: Sequence[Estimate]) -> dict[str, dict[str, Any]]:
     return result
 
 
-def record(result: FitResult) -> dict[str, Any]:
+def record(result: Findings) -> dict[str, Any]:
     """The contents of ``fit.json``; see the head of this module."""
     return _finite(
         {
@@ -236,7 +236,7 @@ def _sun_degrees(observation: Observation) -> tuple[float, float]:
     return math.degrees(zenith), math.degrees(azimuth)
 
 
-def _image_record(result: FitResult, number: int) -> dict[str, Any]:
+def _image_record(result: Findings, number: int) -> dict[str, Any]:
     observation = result.observations[number]
     zenith, azimuth = _sun_degrees(observation)
     relative = result.residuals[number][observation.used].astype(float)
@@ -260,236 +260,6 @@ def _image_record(result: FitResult, number: int) -> dict[str, Any]:
     }
 
 
-# The table ----------------------------------------------------------------------------------------------------------
-
-
-def format_number(value: float | None, error: float | None = None) -> str:
-    """``value`` with the digits that its ``error`` leaves meaningful (two of the error's own), or five digits."""
-    if value is None or not math.isfinite(value):
-        return "–"
-    if not error or not math.isfinite(error) or not value:
-        return f"{value:.5g}"
-    digits = math.floor(math.log10(abs(value))) - math.floor(math.log10(error)) + 2
-    return f"{value:#.{max(2, min(digits, 8))}g}".rstrip(".")
-
-
-class _Row(NamedTuple):
-    """An estimate as text."""
-
-    parameter: str
-    unit: str
-    nm: str
-    fitted: str
-    error: str
-    relative: str
-    start: str
-    truth: str
-    pull: str
-
-
-_HEADINGS = _Row("parameter", "unit", "nm", "fitted", "± error", "relative", "start", "truth", "pull")
-
-
-def _row(estimate: Estimate, *, first: bool) -> _Row:
-    """The name is given in the first row of a field only."""
-    error, value = estimate.standard_error, estimate.value
-    if estimate.at_bound:
-        shown = "at its bound"
-    elif error is None:
-        shown = "not determined"
-    else:
-        shown = f"{error:.2g}"
-    return _Row(
-        parameter=estimate.field if first else "",
-        unit=estimate.unit if first else "",
-        nm="" if estimate.wavelength is None else f"{estimate.wavelength:g}",
-        fitted=format_number(value, error),
-        error=shown,
-        relative=f"{100 * error / abs(value):.2g} %" if error is not None and value else "",
-        start="" if estimate.initial is None else f"{estimate.initial:.3g}",
-        truth="" if estimate.truth is None else f"{estimate.truth:.5g}",
-        pull="" if estimate.pull is None else f"{estimate.pull:+.1f}",
-    )
-
-
-def _rows(result: FitResult) -> list[tuple[_Row, Estimate, bool]]:
-    """All rows of the table, with what they show, and whether a rule goes above (a new kind of number begins)."""
-    groups = [[e for e in result.parameters if e.derived == derived] for derived in (False, True)] + [result.exposures]
-    rows = []
-    for number, group in enumerate(groups):
-        before = None
-        for estimate in group:
-            rule = before is None and number > 0
-            rows.append((_row(estimate, first=estimate.field != before), estimate, rule))
-            before = estimate.field
-    return rows
-
-
-def _columns(result: FitResult, without: Sequence[str] = ()) -> list[str]:
-    known = any(e.truth is not None for e in result.parameters)
-    return [name for name in _Row._fields if name not in without and (known or name not in ("truth", "pull"))]
-
-
-def table(result: FitResult, truth: Atmosphere | None = None) -> Table:
-    """Fitted values, error bars and, where it is known, the truth, for a terminal of 80 columns."""
-    if truth is not None:
-        result = result.with_truth(truth)
-    columns = _columns(result, without=("unit", "relative"))
-    rich = Table(title=_verdict(result), title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False)
-    rich.caption, rich.caption_justify = "Lengths in km, coefficients in 1/km.", "left"
-    for name in columns:
-        rich.add_column(getattr(_HEADINGS, name), justify="left" if name == "parameter" else "right")
-    for row, estimate, rule in _rows(result):
-        if rule:
-            rich.add_section()
-        far = estimate.pull is not None and abs(estimate.pull) > FAR
-        rich.add_row(*(Text(getattr(row, name), style="red" if far and name == "pull" else "") for name in columns))
-    return rich
-
-
-def _verdict(result: FitResult) -> str:
-    state = "Converged" if result.converged else "Not converged"
-    return f"{state} after {result.iterations} iterations, reduced χ² = {result.reduced_chi2:.3f}"
-
-
-# The pictures -------------------------------------------------------------------------------------------------------
-
-_MASKED = (0.82, 0.83, 0.85)
-"""Grey of the pixels that were not used."""
-
-
-def developed(
-    observation: Observation, fitted: Image, wavelengths: Sequence[float]
-) -> tuple[Float[np.ndarray, "height width 3"], Float[np.ndarray, "height width 3"]]:
-    """The measured and the fitted image for a screen, through the same exposure and tone curve."""
-    bands = jnp.asarray(wavelengths)
-    used = jnp.asarray(observation.image[observation.used])
-    exposure = color.auto_exposure(color.to_linear_srgb(used, wavelengths=bands))
-
-    def develop(image: Image) -> Float[np.ndarray, "height width 3"]:
-        known = observation.shown[..., None] & np.isfinite(image).all(axis=-1, keepdims=True)
-        rgb = color.display(jnp.asarray(np.where(known, image, 0)), wavelengths=bands, exposure=exposure)
-        return np.where(known, rgb, _MASKED)
-
-    return develop(observation.image), develop(fitted)
-
-
-def residual_scale(residuals: Sequence[Image]) -> float:
-    """The common end of the symmetric colour scale of all residuals: 99 % of the pixels are within it."""
-    values = np.concatenate([np.abs(image[np.isfinite(image)]) for image in residuals])
-    return max(float(np.percentile(values, 99)), 1e-6) if values.size else 1.0
-
-
-def diverging(values: Float[np.ndarray, "height width"], scale: float) -> Float[np.ndarray, "height width 3"]:
-    """Blue to red over ±``scale``, white at 0, grey where there is no number."""
-    colours = matplotlib.colormaps["RdBu_r"](Normalize(-scale, scale)(np.nan_to_num(values)))
-    return np.where(np.isfinite(values)[..., None], colours[..., :3], _MASKED)
-
-
-def _embed(figure: Figure) -> str:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=110)
-    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
-
-
-def bare(axes: Axes, title: str) -> None:
-    """A panel for a picture: a title, no ticks."""
-    axes.set_title(title, fontsize=9)
-    axes.set_xticks([])
-    axes.set_yticks([])
-
-
-def image_figure(
-    observation: Observation, fitted: Image, residual: Image, wavelengths: Sequence[float], scale: float
-) -> Figure:
-    """Measured and fitted side by side, and below them the relative residual of each wavelength (if up to three)."""
-    channels = {f"residual at {nm:g} nm": residual[..., i] for i, nm in enumerate(wavelengths)}
-    if len(channels) > 3:
-        channels = {"residual, mean of all wavelengths": np.mean(residual, axis=-1)}
-    height, width = observation.used.shape
-    rows = [height / width / 2, height / width / max(len(channels), 2)]
-    figure = Figure(figsize=(10, 10 * sum(rows) + 1.1), layout="constrained")
-    above, below = figure.subfigures(2, 1, height_ratios=rows, squeeze=False)[:, 0]
-    pictures = developed(observation, fitted, wavelengths)
-    for axes, picture, title in zip(above.subplots(1, 2), pictures, ("measured", "fitted"), strict=True):
-        axes.imshow(picture, interpolation="nearest")
-        bare(axes, title)
-    panels = np.atleast_1d(below.subplots(1, len(channels)))
-    norm = Normalize(-100 * scale, 100 * scale)
-    for axes, (title, values) in zip(panels, channels.items(), strict=True):
-        axes.imshow(diverging(values, scale), interpolation="nearest")
-        bare(axes, title)
-    bar = below.colorbar(ScalarMappable(norm, "RdBu_r"), ax=list(panels), shrink=0.8, pad=0.01)
-    bar.set_label("residual, %", fontsize=8)
-    bar.ax.tick_params(labelsize=8)
-    return figure
-
-
-def convergence_figure(result: FitResult) -> Figure:
-    """Reduced χ² and the distance to the optimum against the step; rejected steps are hollow."""
-    figure = Figure(figsize=(6.2, 3.4), layout="constrained")
-    axes = figure.subplots()
-    steps = np.array([step.step for step in result.history])
-    chi2 = np.array([step.reduced_chi2 for step in result.history])
-    accepted = np.array([step.accepted for step in result.history]) & np.isfinite(chi2)
-    rejected = ~accepted & np.isfinite(chi2)
-    axes.semilogy(steps[accepted], chi2[accepted], "o-", color="#1f5fa8", label="reduced χ²")
-    if rejected.any():
-        axes.semilogy(steps[rejected], chi2[rejected], "o", color="#1f5fa8", fillstyle="none", label="rejected step")
-    distance = np.array([max(step.distance, 1e-12) for step in result.history])
-    axes.semilogy(steps, distance, ".--", color="#c2571a", label="distance to the optimum, standard errors")
-    for step, following in zip(result.history[:-1], result.history[1:], strict=True):
-        if following.stage != step.stage:
-            axes.axvline(following.step - 0.5, color="#888", linewidth=0.8)
-    axes.set_xlabel("step")
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    axes.legend(fontsize=8, frameon=False)
-    axes.grid(alpha=0.25)
-    return figure
-
-
-def fitted_correlation(result: FitResult) -> tuple[list[str], Float[np.ndarray, "n n"]]:
-    """Names and correlation matrix of the fitted numbers, without those that follow from them."""
-    derived = {estimate.name for estimate in result.parameters if estimate.derived}
-    kept = [number for number, name in enumerate(result.covariance_names) if name not in derived]
-    return [result.covariance_names[number] for number in kept], result.correlation[np.ix_(kept, kept)]
-
-
-def correlation_figure(result: FitResult) -> Figure:
-    """Correlation matrix of the fitted numbers."""
-    names, matrix = fitted_correlation(result)
-    size = 2.6 + 0.2 * len(names)
-    figure = Figure(figsize=(size + 0.6, size), layout="constrained")
-    axes = figure.subplots()
-    shown = axes.imshow(np.ma.masked_invalid(matrix), cmap="RdBu_r", vmin=-1, vmax=1)
-    axes.set_facecolor(_MASKED)
-    axes.set_xticks(range(len(names)), names, rotation=90, fontsize=7)
-    axes.set_yticks(range(len(names)), names, fontsize=7)
-    figure.colorbar(shown, ax=axes, shrink=0.7)
-    return figure
-
-
-def histogram_figure(result: FitResult) -> Figure:
-    """Distribution of the residuals in sigmas against the normal one they should follow."""
-    figure = Figure(figsize=(6.2, 3.4), layout="constrained")
-    axes = figure.subplots()
-    edges = np.linspace(-6, 6, 61)
-    for observation, whitened in zip(result.observations, result.whitened, strict=True):
-        axes.hist(
-            np.clip(whitened[observation.used], -6, 6).ravel(),
-            bins=list(edges),
-            density=True,
-            histtype="step",
-            label=observation.name,
-        )
-    axes.plot(edges, np.exp(-(edges**2) / 2) / math.sqrt(2 * math.pi), "k--", linewidth=1, label="normal")
-    axes.set_yscale("log")
-    axes.set_ylim(1e-5, 1)
-    axes.set_xlabel("(measured - fitted) / sigma")
-    axes.legend(fontsize=8, frameon=False)
-    return figure
-
-
 # The page -----------------------------------------------------------------------------------------------------------
 
 STYLE = """
@@ -505,7 +275,7 @@ th:nth-child(-n+2), td:nth-child(-n+2) { text-align: left; } tr.rule td { border
 """
 
 
-def page(result: FitResult) -> str:
+def page(result: Findings) -> str:
     """The report as one HTML document that needs nothing else."""
     wavelengths = [float(nm) for nm in result.atmosphere.wavelengths]
     scale = residual_scale(result.residuals)
@@ -520,11 +290,11 @@ def page(result: FitResult) -> str:
         "<!doctype html><html lang=en><meta charset=utf-8><meta name=viewport content='width=device-width'>",
         f"<title>diffatmo fit</title><style>{STYLE}</style>",
         "<h1>Which atmosphere made this sky?</h1>",
-        f"<p class={'good' if result.converged else 'bad'}><strong>{_verdict(result)}.</strong></p>",
+        f"<p class={'good' if result.converged else 'bad'}><strong>{verdict(result)}.</strong></p>",
         f"<p class=soft>{html.escape(result.message)}. Time: {seconds}.</p>",
-        "".join(f"<p>{note}</p>" for note in _notes(result)),
+        "".join(f"<p>{html.escape(note)}</p>" for note in notes(result)),
         "<h2>Parameters</h2>",
-        _html_table(result),
+        page_table(result),
         "<h2>Images</h2>",
         *images,
         "<h2>Fit</h2><div class=pair>",
@@ -539,6 +309,12 @@ def page(result: FitResult) -> str:
         "</html>",
     ]
     return "\n".join(parts)
+
+
+def _embed(figure: Figure) -> str:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=110)
+    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
 
 
 def figure_tag(figure: Figure, caption: str) -> str:
@@ -557,46 +333,3 @@ def _caption(observation: Observation, about: dict[str, Any]) -> str:
         f"{about['pixels_used']} pixels used{binned}{f', left out: {masked}' if masked else ''}. "
         f"Median |residual| per wavelength: {median} %; residual over stated noise, RMS: {of_sigma}."
     )
-
-
-TIED = 0.99999
-"""Correlation of numbers that are multiples of each other."""
-
-
-def _notes(result: FitResult) -> list[str]:
-    """In words, what a reader of the table must know."""
-    notes = []
-    if result.undetermined:
-        notes.append(f"The images do not determine {html.escape(', '.join(result.undetermined))}.")
-    if held := [e.name for e in result.parameters if e.at_bound]:
-        notes.append(f"At the bound of the range: {html.escape(', '.join(held))}.")
-    if result.error_scale > 1.05:
-        notes.append(
-            f"The residuals are {result.error_scale:.1f} times as large as the stated noise, and so are the standard "
-            "errors. If the noise is right, the model does not describe the images as precisely as it should."
-        )
-    names, signed = fitted_correlation(result)
-    matrix = np.abs(np.nan_to_num(signed))
-    pairs = [
-        (matrix[i, j], names[i], names[j])
-        for i in range(len(matrix))
-        for j in range(i)
-        # Numbers that share one factor are one number.
-        if 0.95 < matrix[i, j] < TIED
-    ]
-    if pairs:
-        named = "; ".join(f"{a} and {b} ({r:.3f})" for r, a, b in sorted(pairs, reverse=True)[:6])
-        notes.append(f"Determined well only in combination, as their strong correlation tells: {html.escape(named)}.")
-    return notes
-
-
-def _html_table(result: FitResult) -> str:
-    columns = _columns(result)
-    lines = ["<tr>" + "".join(f"<th>{getattr(_HEADINGS, name)}</th>" for name in columns) + "</tr>"]
-    for row, estimate, rule in _rows(result):
-        cells = {name: html.escape(getattr(row, name)) for name in columns}
-        if estimate.pull is not None:
-            cells["pull"] = f"<span class={'bad' if abs(estimate.pull) > FAR else 'good'}>{cells['pull']}</span>"
-        line = "".join(f"<td>{cell}</td>" for cell in cells.values())
-        lines.append(f"<tr{' class=rule' if rule else ''}>{line}</tr>")
-    return "<table>" + "".join(lines) + "</table>"

@@ -18,7 +18,6 @@ and neither leaves room for more confidence.
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
 from typing import Any
 
 import jax
@@ -29,117 +28,12 @@ from jaxtyping import Array, Float
 from diffatmo.atmosphere import Atmosphere
 from diffatmo.compiling import outermost
 from diffatmo.models import Model, Moments
-from fitting._errors import FitError
-from fitting.observation import Observation, sigma, unstack
+from fitting.findings import Estimate
+from fitting.observation import Observation, unstack
 from fitting.parameters import Coordinates, Parameters
 from fitting.quantities import numbers, quantities
-from fitting.solve import MAX_STEPS, RANK_TOLERANCE, TOLERANCE, Progress, Solution, Step, solve
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """A number with its error bar; ``standard_error`` is None where the images do not determine it.
-
-    ``field`` and ``wavelength`` (nm) say what ``name`` stands for; ``derived`` marks combinations of fitted numbers,
-    and ``at_bound`` values held by the edge of their range, whose error bar only tells how sharp the edge is
-    approached.
-    """
-
-    name: str
-    field: str
-    wavelength: float | None
-    unit: str
-    value: float
-    standard_error: float | None
-    initial: float | None
-    truth: float | None = None
-    derived: bool = False
-    at_bound: bool = False
-
-    @property
-    def pull(self) -> float | None:
-        """(value - truth) / standard error."""
-        if self.truth is None or not self.standard_error:
-            return None
-        return (self.value - self.truth) / self.standard_error
-
-
-@dataclass(frozen=True)
-class FitResult:
-    """What a fit found. Arrays are NumPy's; ``covariance`` belongs to the numbers named in ``covariance_names``.
-
-    Covariances of numbers that the images do not determine are NaN. ``fitted`` are the expected images in the units
-    of the measured ones (NaN outside the fitted region), ``observations`` the images as they were fitted.
-    """
-
-    atmosphere: Atmosphere
-    parameters: list[Estimate]
-    exposures: list[Estimate]
-    covariance: Float[np.ndarray, "q q"]
-    covariance_names: list[str]
-    chi2: float
-    degrees_of_freedom: int
-    error_scale: float
-    iterations: int
-    converged: bool
-    message: str
-    history: list[Step]
-    timings: dict[str, float]
-    observations: list[Observation]
-    fitted: list[Float[np.ndarray, "height width w"]]
-    undetermined: list[str] = field(default_factory=list)
-
-    @property
-    def reduced_chi2(self) -> float:
-        """χ² per degree of freedom: 1 if the model and the stated noise explain the images."""
-        return self.chi2 / max(self.degrees_of_freedom, 1)
-
-    @property
-    def correlation(self) -> Float[np.ndarray, "q q"]:
-        """Correlation matrix of the numbers named in ``covariance_names``; NaN for those without an error."""
-        return correlation(self.covariance)
-
-    @property
-    def residuals(self) -> list[Float[np.ndarray, "height width w"]]:
-        """measured / fitted - 1 of each image, NaN where a pixel was not used."""
-        result = []
-        for observation, image in zip(self.observations, self.fitted, strict=True):
-            known = observation.used[..., None] & (image > 0)
-            result.append(np.where(known, observation.image / np.where(known, image, 1) - 1, np.nan).astype(np.float32))
-        return result
-
-    @property
-    def whitened(self) -> list[Float[np.ndarray, "height width w"]]:
-        """(measured - fitted) / sigma of each image, NaN where a pixel was not used."""
-        return [
-            np.where(o.used[..., None], (o.image - image) / np.asarray(sigma(o, image)), np.nan).astype(np.float32)
-            for o, image in zip(self.observations, self.fitted, strict=True)
-        ]
-
-    def estimate(self, name: str) -> Estimate:
-        """The parameter, derived quantity or exposure called ``name``."""
-        for estimate in [*self.parameters, *self.exposures]:
-            if estimate.name == name:
-                return estimate
-        raise KeyError(name)
-
-    def with_truth(self, truth: Atmosphere) -> "FitResult":
-        """The same result with the true value beside each parameter; raises :class:`FitError` for other wavelengths."""
-        own = np.asarray(self.atmosphere.wavelengths)
-        if truth.wavelengths.shape != own.shape or not np.allclose(truth.wavelengths, own):
-            raise FitError(f"truth: has wavelengths {truth.wavelengths.tolist()}, the fit {own.tolist()}")
-        fields = list(dict.fromkeys(estimate.field for estimate in self.parameters))
-        values = np.asarray(numbers(truth, fields), dtype=float)
-        return replace(
-            self, parameters=[replace(e, truth=float(v)) for e, v in zip(self.parameters, values, strict=True)]
-        )
-
-
-def correlation(covariance: Float[np.ndarray, "q q"]) -> Float[np.ndarray, "q q"]:
-    """Covariance divided by both standard deviations; NaN where a variance is zero or unknown."""
-    deviation = np.sqrt(np.diag(covariance))
-    deviation = np.where(deviation > 0, deviation, np.nan)
-    return covariance / np.outer(deviation, deviation)
+from fitting.result import FitResult
+from fitting.solve import MAX_STEPS, RANK_TOLERANCE, TOLERANCE, Progress, Solution, solve
 
 
 def propagate(
@@ -204,7 +98,7 @@ def summarise(solution: Solution, observations: Sequence[Observation]) -> FitRes
             field=quantity.field,
             wavelength=quantity.wavelength,
             unit=quantity.unit,
-            value=values[i],
+            value=float(values[i]),
             standard_error=errors[i],
             initial=float(initial[i]),
             derived=i >= len(fitted_quantities),
@@ -213,7 +107,7 @@ def summarise(solution: Solution, observations: Sequence[Observation]) -> FitRes
         for i, quantity in enumerate(all_quantities)
     ]
     factors = [
-        Estimate(name, name, None, "", values[i], errors[i], None)
+        Estimate(name, name, None, "", float(values[i]), errors[i], None)
         for i, name in enumerate(solution.exposure_names, start=len(all_quantities))
     ]
     return FitResult(

@@ -42,8 +42,10 @@ LEVELS = [
     ["fitting.parameters", "fitting.observation"],
     ["fitting.residuals"],
     ["fitting.solve"],
+    ["fitting.findings"],
+    ["fitting.tables", "fitting.figures"],
+    ["fitting.report", "fitting.result"],
     ["fitting.uncertainty"],
-    ["fitting.report"],
     ["fitting"],
     ["diffatmo"],  # the lazy public interface
     ["diffatmo.cli", "diffatmo.cli.cache", "diffatmo.cli.common"],

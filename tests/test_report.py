@@ -11,6 +11,7 @@ from rich.console import Console
 
 from diffatmo import atmosphere, imageio, scene
 from fitting import FitError, report
+from fitting.tables import format_number
 
 
 @pytest.fixture(scope="module")
@@ -187,4 +188,4 @@ def test_table_fits_into_eighty_columns():
     ],
 )
 def test_numbers_show_the_digits_that_mean_something(value, error, text):
-    assert report.format_number(value, error) == text
+    assert format_number(value, error) == text

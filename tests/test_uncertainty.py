@@ -6,7 +6,8 @@ import toy_sky
 from toy_sky import FREE, Toy
 
 from fitting import FitError, fit
-from fitting.uncertainty import correlation, propagate
+from fitting.findings import correlation
+from fitting.uncertainty import propagate
 
 
 def test_propagation_is_the_delta_method():

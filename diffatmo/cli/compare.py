@@ -148,7 +148,7 @@ def _sheet(scene: "Scene", outcomes: "dict[str, Outcome]", truth: str) -> "Figur
     from matplotlib.figure import Figure
 
     from diffatmo import color, comparison
-    from fitting import report
+    from fitting import figures
 
     wavelengths = scene.atmosphere.wavelengths
     exposure = color.auto_exposure(color.to_linear_srgb(jnp.asarray(outcomes[truth].picture), wavelengths=wavelengths))
@@ -164,11 +164,11 @@ def _sheet(scene: "Scene", outcomes: "dict[str, Outcome]", truth: str) -> "Figur
     for column, (name, outcome) in enumerate(outcomes.items()):
         shown = color.display(jnp.asarray(outcome.picture), wavelengths=wavelengths, exposure=exposure)
         axes[0, column].imshow(np.asarray(shown), interpolation="nearest")
-        report.bare(axes[0, column], name)
+        figures.bare(axes[0, column], name)
         for row, band in enumerate(bands, start=1):
             panel = axes[row, column]
-            panel.imshow(report.diverging(errors[name][..., band], scale), interpolation="nearest")
-            report.bare(panel, f"{float(wavelengths[band]):g} nm" if name != truth else "truth")
+            panel.imshow(figures.diverging(errors[name][..., band], scale), interpolation="nearest")
+            figures.bare(panel, f"{float(wavelengths[band]):g} nm" if name != truth else "truth")
     bar = figure.colorbar(
         ScalarMappable(Normalize(-100 * scale, 100 * scale), "RdBu_r"), ax=list(axes[1:].flat), shrink=0.6, pad=0.01
     )

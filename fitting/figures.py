@@ -1,0 +1,142 @@
+"""The figures of a fit: images, fits and residuals side by side, convergence, correlation, distribution of residuals."""
+
+import math
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import matplotlib
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from diffatmo import color
+from fitting.findings import Findings
+from fitting.observation import Observation
+
+Image = Float[np.ndarray, "height width w"]
+
+_MASKED = (0.82, 0.83, 0.85)
+"""Grey of the pixels that were not used."""
+
+
+def developed(
+    observation: Observation, fitted: Image, wavelengths: Sequence[float]
+) -> tuple[Float[np.ndarray, "height width 3"], Float[np.ndarray, "height width 3"]]:
+    """The measured and the fitted image for a screen, through the same exposure and tone curve."""
+    bands = jnp.asarray(wavelengths)
+    used = jnp.asarray(observation.image[observation.used])
+    exposure = color.auto_exposure(color.to_linear_srgb(used, wavelengths=bands))
+
+    def develop(image: Image) -> Float[np.ndarray, "height width 3"]:
+        known = observation.shown[..., None] & np.isfinite(image).all(axis=-1, keepdims=True)
+        rgb = color.display(jnp.asarray(np.where(known, image, 0)), wavelengths=bands, exposure=exposure)
+        return np.where(known, rgb, _MASKED)
+
+    return develop(observation.image), develop(fitted)
+
+
+def residual_scale(residuals: Sequence[Image]) -> float:
+    """The common end of the symmetric colour scale of all residuals: 99 % of the pixels are within it."""
+    values = np.concatenate([np.abs(image[np.isfinite(image)]) for image in residuals])
+    return max(float(np.percentile(values, 99)), 1e-6) if values.size else 1.0
+
+
+def diverging(values: Float[np.ndarray, "height width"], scale: float) -> Float[np.ndarray, "height width 3"]:
+    """Blue to red over ±``scale``, white at 0, grey where there is no number."""
+    colours = matplotlib.colormaps["RdBu_r"](Normalize(-scale, scale)(np.nan_to_num(values)))
+    return np.where(np.isfinite(values)[..., None], colours[..., :3], _MASKED)
+
+
+def bare(axes: Axes, title: str) -> None:
+    """A panel for a picture: a title, no ticks."""
+    axes.set_title(title, fontsize=9)
+    axes.set_xticks([])
+    axes.set_yticks([])
+
+
+def image_figure(
+    observation: Observation, fitted: Image, residual: Image, wavelengths: Sequence[float], scale: float
+) -> Figure:
+    """Measured and fitted side by side, and below them the relative residual of each wavelength (if up to three)."""
+    channels = {f"residual at {nm:g} nm": residual[..., i] for i, nm in enumerate(wavelengths)}
+    if len(channels) > 3:
+        channels = {"residual, mean of all wavelengths": np.mean(residual, axis=-1)}
+    height, width = observation.used.shape
+    rows = [height / width / 2, height / width / max(len(channels), 2)]
+    figure = Figure(figsize=(10, 10 * sum(rows) + 1.1), layout="constrained")
+    above, below = figure.subfigures(2, 1, height_ratios=rows, squeeze=False)[:, 0]
+    pictures = developed(observation, fitted, wavelengths)
+    for axes, picture, title in zip(above.subplots(1, 2), pictures, ("measured", "fitted"), strict=True):
+        axes.imshow(picture, interpolation="nearest")
+        bare(axes, title)
+    panels = np.atleast_1d(below.subplots(1, len(channels)))
+    norm = Normalize(-100 * scale, 100 * scale)
+    for axes, (title, values) in zip(panels, channels.items(), strict=True):
+        axes.imshow(diverging(values, scale), interpolation="nearest")
+        bare(axes, title)
+    bar = below.colorbar(ScalarMappable(norm, "RdBu_r"), ax=list(panels), shrink=0.8, pad=0.01)
+    bar.set_label("residual, %", fontsize=8)
+    bar.ax.tick_params(labelsize=8)
+    return figure
+
+
+def convergence_figure(result: Findings) -> Figure:
+    """Reduced χ² and the distance to the optimum against the step; rejected steps are hollow."""
+    figure = Figure(figsize=(6.2, 3.4), layout="constrained")
+    axes = figure.subplots()
+    steps = np.array([step.step for step in result.history])
+    chi2 = np.array([step.reduced_chi2 for step in result.history])
+    accepted = np.array([step.accepted for step in result.history]) & np.isfinite(chi2)
+    rejected = ~accepted & np.isfinite(chi2)
+    axes.semilogy(steps[accepted], chi2[accepted], "o-", color="#1f5fa8", label="reduced χ²")
+    if rejected.any():
+        axes.semilogy(steps[rejected], chi2[rejected], "o", color="#1f5fa8", fillstyle="none", label="rejected step")
+    distance = np.array([max(step.distance, 1e-12) for step in result.history])
+    axes.semilogy(steps, distance, ".--", color="#c2571a", label="distance to the optimum, standard errors")
+    for step, following in zip(result.history[:-1], result.history[1:], strict=True):
+        if following.stage != step.stage:
+            axes.axvline(following.step - 0.5, color="#888", linewidth=0.8)
+    axes.set_xlabel("step")
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.legend(fontsize=8, frameon=False)
+    axes.grid(alpha=0.25)
+    return figure
+
+
+def correlation_figure(result: Findings) -> Figure:
+    """Correlation matrix of the fitted numbers."""
+    names, matrix = result.fitted_correlation
+    size = 2.6 + 0.2 * len(names)
+    figure = Figure(figsize=(size + 0.6, size), layout="constrained")
+    axes = figure.subplots()
+    shown = axes.imshow(np.ma.masked_invalid(matrix), cmap="RdBu_r", vmin=-1, vmax=1)
+    axes.set_facecolor(_MASKED)
+    axes.set_xticks(range(len(names)), names, rotation=90, fontsize=7)
+    axes.set_yticks(range(len(names)), names, fontsize=7)
+    figure.colorbar(shown, ax=axes, shrink=0.7)
+    return figure
+
+
+def histogram_figure(result: Findings) -> Figure:
+    """Distribution of the residuals in sigmas against the normal one they should follow."""
+    figure = Figure(figsize=(6.2, 3.4), layout="constrained")
+    axes = figure.subplots()
+    edges = np.linspace(-6, 6, 61)
+    for observation, whitened in zip(result.observations, result.whitened, strict=True):
+        axes.hist(
+            np.clip(whitened[observation.used], -6, 6).ravel(),
+            bins=list(edges),
+            density=True,
+            histtype="step",
+            label=observation.name,
+        )
+    axes.plot(edges, np.exp(-(edges**2) / 2) / math.sqrt(2 * math.pi), "k--", linewidth=1, label="normal")
+    axes.set_yscale("log")
+    axes.set_ylim(1e-5, 1)
+    axes.set_xlabel("(measured - fitted) / sigma")
+    axes.legend(fontsize=8, frameon=False)
+    return figure

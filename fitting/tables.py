@@ -1,0 +1,150 @@
+"""The numbers of a fit as tables: for a terminal, for a page, for other programs; and in words what must be known of them."""
+
+import html
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from rich.box import SIMPLE_HEAD
+from rich.table import Table
+from rich.text import Text
+
+from diffatmo.atmosphere import Atmosphere
+from fitting.findings import Estimate, Findings
+
+FAR = 3.0
+"""Standard errors from the truth beyond which an estimate is marked."""
+
+TIED = 0.99999
+"""Correlation of numbers that are multiples of each other."""
+
+
+def format_number(value: float | None, error: float | None = None) -> str:
+    """``value`` with the digits that its ``error`` leaves meaningful (two of the error's own), or five digits."""
+    if value is None or not math.isfinite(value):
+        return "–"
+    if not error or not math.isfinite(error) or not value:
+        return f"{value:.5g}"
+    digits = math.floor(math.log10(abs(value))) - math.floor(math.log10(error)) + 2
+    return f"{value:#.{max(2, min(digits, 8))}g}".rstrip(".")
+
+
+class _Row(NamedTuple):
+    """An estimate as text."""
+
+    parameter: str
+    unit: str
+    nm: str
+    fitted: str
+    error: str
+    relative: str
+    start: str
+    truth: str
+    pull: str
+
+
+_HEADINGS = _Row("parameter", "unit", "nm", "fitted", "± error", "relative", "start", "truth", "pull")
+
+
+def _row(estimate: Estimate, *, first: bool) -> _Row:
+    """The name is given in the first row of a field only."""
+    error, value = estimate.standard_error, estimate.value
+    if estimate.at_bound:
+        shown = "at its bound"
+    elif error is None:
+        shown = "not determined"
+    else:
+        shown = f"{error:.2g}"
+    return _Row(
+        parameter=estimate.field if first else "",
+        unit=estimate.unit if first else "",
+        nm="" if estimate.wavelength is None else f"{estimate.wavelength:g}",
+        fitted=format_number(value, error),
+        error=shown,
+        relative=f"{100 * error / abs(value):.2g} %" if error is not None and value else "",
+        start="" if estimate.initial is None else f"{estimate.initial:.3g}",
+        truth="" if estimate.truth is None else f"{estimate.truth:.5g}",
+        pull="" if estimate.pull is None else f"{estimate.pull:+.1f}",
+    )
+
+
+def _rows(result: Findings) -> list[tuple[_Row, Estimate, bool]]:
+    """All rows of the table, with what they show, and whether a rule goes above (a new kind of number begins)."""
+    groups = [[e for e in result.parameters if e.derived == derived] for derived in (False, True)] + [result.exposures]
+    rows = []
+    for number, group in enumerate(groups):
+        before = None
+        for estimate in group:
+            rule = before is None and number > 0
+            rows.append((_row(estimate, first=estimate.field != before), estimate, rule))
+            before = estimate.field
+    return rows
+
+
+def _columns(result: Findings, without: Sequence[str] = ()) -> list[str]:
+    known = any(e.truth is not None for e in result.parameters)
+    return [name for name in _Row._fields if name not in without and (known or name not in ("truth", "pull"))]
+
+
+def table(result: Findings, truth: Atmosphere | None = None) -> Table:
+    """Fitted values, error bars and, where it is known, the truth, for a terminal of 80 columns."""
+    if truth is not None:
+        result = result.with_truth(truth)
+    columns = _columns(result, without=("unit", "relative"))
+    rich = Table(title=verdict(result), title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False)
+    rich.caption, rich.caption_justify = "Lengths in km, coefficients in 1/km.", "left"
+    for name in columns:
+        rich.add_column(getattr(_HEADINGS, name), justify="left" if name == "parameter" else "right")
+    for row, estimate, rule in _rows(result):
+        if rule:
+            rich.add_section()
+        far = estimate.pull is not None and abs(estimate.pull) > FAR
+        rich.add_row(*(Text(getattr(row, name), style="red" if far and name == "pull" else "") for name in columns))
+    return rich
+
+
+def verdict(result: Findings) -> str:
+    """How the fit ended, in one line."""
+    state = "Converged" if result.converged else "Not converged"
+    return f"{state} after {result.iterations} iterations, reduced χ² = {result.reduced_chi2:.3f}"
+
+
+def notes(result: Findings) -> list[str]:
+    """In words, what a reader of the table must know."""
+    found = []
+    if result.undetermined:
+        found.append(f"The images do not determine {', '.join(result.undetermined)}.")
+    if held := [e.name for e in result.parameters if e.at_bound]:
+        found.append(f"At the bound of the range: {', '.join(held)}.")
+    if result.error_scale > 1.05:
+        found.append(
+            f"The residuals are {result.error_scale:.1f} times as large as the stated noise, and so are the standard "
+            "errors. If the noise is right, the model does not describe the images as precisely as it should."
+        )
+    names, signed = result.fitted_correlation
+    matrix = np.abs(np.nan_to_num(signed))
+    pairs = [
+        (matrix[i, j], names[i], names[j])
+        for i in range(len(matrix))
+        for j in range(i)
+        # Numbers that share one factor are one number.
+        if 0.95 < matrix[i, j] < TIED
+    ]
+    if pairs:
+        named = "; ".join(f"{a} and {b} ({r:.3f})" for r, a, b in sorted(pairs, reverse=True)[:6])
+        found.append(f"Determined well only in combination, as their strong correlation tells: {named}.")
+    return found
+
+
+def page_table(result: Findings) -> str:
+    """The table as HTML."""
+    columns = _columns(result)
+    lines = ["<tr>" + "".join(f"<th>{getattr(_HEADINGS, name)}</th>" for name in columns) + "</tr>"]
+    for row, estimate, rule in _rows(result):
+        cells = {name: html.escape(getattr(row, name)) for name in columns}
+        if estimate.pull is not None:
+            cells["pull"] = f"<span class={'bad' if abs(estimate.pull) > FAR else 'good'}>{cells['pull']}</span>"
+        line = "".join(f"<td>{cell}</td>" for cell in cells.values())
+        lines.append(f"<tr{' class=rule' if rule else ''}>{line}</tr>")
+    return "<table>" + "".join(lines) + "</table>"
