@@ -7,13 +7,26 @@
     fitting.report.write(result, "out")
 """
 
-from fitting import report
+from fitting import priors, report
 from fitting._errors import FitError
 from fitting.findings import Estimate
 from fitting.observation import Observation, observe
 from fitting.parameters import FREE_FIELDS
+from fitting.priors import Prior
 from fitting.result import FitResult
 from fitting.solve import Step
 from fitting.uncertainty import fit
 
-__all__ = ["FREE_FIELDS", "Estimate", "FitError", "FitResult", "Observation", "Step", "fit", "observe", "report"]
+__all__ = [
+    "FREE_FIELDS",
+    "Estimate",
+    "FitError",
+    "FitResult",
+    "Observation",
+    "Prior",
+    "Step",
+    "fit",
+    "observe",
+    "priors",
+    "report",
+]

@@ -13,6 +13,7 @@ from jaxtyping import Float
 from diffatmo.atmosphere import Atmosphere
 from fitting._errors import FitError
 from fitting.observation import Observation, sigma
+from fitting.priors import Prior
 from fitting.quantities import numbers
 from fitting.solve import Step
 
@@ -36,6 +37,8 @@ class Estimate:
     truth: float | None = None
     derived: bool = False
     at_bound: bool = False
+    data_share: float | None = None
+    """The part of its precision that comes from the images, not from priors."""
 
     @property
     def pull(self) -> float | None:
@@ -69,6 +72,9 @@ class Findings:
     observations: list[Observation]
     fitted: list[Float[np.ndarray, "height width w"]]
     undetermined: list[str] = field(default_factory=list)
+    priors: list[Prior] = field(default_factory=list)
+    outliers: list[int] = field(default_factory=list)
+    """Pixels of each image to which a robust loss gave less than half their weight."""
 
     @property
     def reduced_chi2(self) -> float:
