@@ -4,6 +4,8 @@
 
     observation = fitting.observe(pixels, camera=camera, altitude=0.1, sun=sun.direction(zenith=0.7, azimuth=0.0))
     result = fitting.fit([observation], init=earth(), free=["rayleigh_scattering", "mie_scattering", "mie_g"])
+    result                                      # the table, in a notebook
+    result.predict(scene).standard_error        # the same air elsewhere, with error bars
     fitting.report.write(result, "out")
 """
 
@@ -12,8 +14,20 @@ from fitting._errors import FitError
 from fitting.findings import Estimate
 from fitting.observation import Observation, observe
 from fitting.parameters import FREE_FIELDS
+from fitting.prediction import Prediction
 from fitting.result import FitResult
 from fitting.solve import Step
 from fitting.uncertainty import fit
 
-__all__ = ["FREE_FIELDS", "Estimate", "FitError", "FitResult", "Observation", "Step", "fit", "observe", "report"]
+__all__ = [
+    "FREE_FIELDS",
+    "Estimate",
+    "FitError",
+    "FitResult",
+    "Observation",
+    "Prediction",
+    "Step",
+    "fit",
+    "observe",
+    "report",
+]

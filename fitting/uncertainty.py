@@ -73,8 +73,8 @@ def _slopes(y: Coordinates, parameters: Parameters) -> Any:
     return jax.jacfwd(_physical, has_aux=True)(y, parameters)
 
 
-def summarise(solution: Solution, observations: Sequence[Observation]) -> FitResult:
-    """Attach error bars to ``solution``."""
+def summarise(solution: Solution, observations: Sequence[Observation], model: Model, *, refine: bool) -> FitResult:
+    """Attach error bars to ``solution``, which was found with ``model``, and its finer self if ``refine``."""
     parameters = solution.parameters
     count = parameters.size
     wavelengths = [float(nm) for nm in parameters.init.wavelengths]
@@ -127,6 +127,8 @@ def summarise(solution: Solution, observations: Sequence[Observation]) -> FitRes
         observations=list(observations),
         fitted=[unstack(o, image) for o, image in zip(observations, solution.predicted, strict=True)],
         undetermined=[e.name for e in [*estimates, *factors] if e.standard_error is None],
+        model=model,
+        refine=refine,
     )
 
 
@@ -166,15 +168,16 @@ def fit(
         FitError: The fit cannot be started: a name that is not a parameter, images that do not go together, a model
             that is not finite at the start.
     """
+    model = Moments() if model is None else model
     solution = solve(
         observations,
         init=init,
         free=free,
         tie=tie,
-        model=Moments() if model is None else model,
+        model=model,
         progress=progress,
         max_steps=max_steps,
         tolerance=tolerance,
         refine=refine,
     )
-    return summarise(solution, observations)
+    return summarise(solution, observations, model, refine=refine)
