@@ -4,6 +4,8 @@
 
     observation = fitting.observe(pixels, camera=camera, altitude=0.1, sun=sun.direction(zenith=0.7, azimuth=0.0))
     result = fitting.fit([observation], init=earth(), free=["rayleigh_scattering", "mie_scattering", "mie_g"])
+    result                                      # the table, in a notebook
+    result.predict(scene).standard_error        # the same air elsewhere, with error bars
     fitting.report.write(result, "out")
 """
 
@@ -12,6 +14,7 @@ from fitting._errors import FitError
 from fitting.findings import Estimate
 from fitting.observation import Observation, observe
 from fitting.parameters import FREE_FIELDS
+from fitting.prediction import Prediction
 from fitting.priors import Prior
 from fitting.result import FitResult
 from fitting.solve import Step
@@ -23,6 +26,7 @@ __all__ = [
     "FitError",
     "FitResult",
     "Observation",
+    "Prediction",
     "Prior",
     "Step",
     "fit",

@@ -1,5 +1,6 @@
 """The figures of a fit: images, fits and residuals side by side, convergence, correlation, distribution of residuals."""
 
+import io
 import math
 from collections.abc import Sequence
 
@@ -10,7 +11,7 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, FigureBase
 from matplotlib.ticker import MaxNLocator
 
 from diffatmo import color
@@ -18,6 +19,21 @@ from fitting.findings import Findings
 from fitting.observation import Observation
 
 Image = Float[np.ndarray, "height width w"]
+
+
+class Sheet(Figure):
+    """A figure without pyplot that a notebook shows all the same."""
+
+    def _repr_png_(self) -> bytes:
+        return as_png(self)
+
+
+def as_png(figure: Figure) -> bytes:
+    """A figure as a PNG file."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=110)
+    return buffer.getvalue()
+
 
 _MASKED = (0.82, 0.83, 0.85)
 """Grey of the pixels that were not used."""
@@ -68,26 +84,47 @@ def image_figure(
         channels = {"residual, mean of all wavelengths": np.mean(residual, axis=-1)}
     height, width = observation.used.shape
     rows = [height / width / 2, height / width / max(len(channels), 2)]
-    figure = Figure(figsize=(10, 10 * sum(rows) + 1.1), layout="constrained")
+    figure = Sheet(figsize=(10, 10 * sum(rows) + 1.1), layout="constrained")
     above, below = figure.subfigures(2, 1, height_ratios=rows, squeeze=False)[:, 0]
     pictures = developed(observation, fitted, wavelengths)
     for axes, picture, title in zip(above.subplots(1, 2), pictures, ("measured", "fitted"), strict=True):
         axes.imshow(picture, interpolation="nearest")
         bare(axes, title)
     panels = np.atleast_1d(below.subplots(1, len(channels)))
-    norm = Normalize(-100 * scale, 100 * scale)
     for axes, (title, values) in zip(panels, channels.items(), strict=True):
         axes.imshow(diverging(values, scale), interpolation="nearest")
         bare(axes, title)
-    bar = below.colorbar(ScalarMappable(norm, "RdBu_r"), ax=list(panels), shrink=0.8, pad=0.01)
+    _residual_bar(below, list(panels), scale)
+    return figure
+
+
+def _residual_bar(figure: FigureBase, axes: list[Axes], scale: float) -> None:
+    """The colours of :func:`diverging` beside ``axes``."""
+    norm = Normalize(-100 * scale, 100 * scale)
+    bar = figure.colorbar(ScalarMappable(norm, "RdBu_r"), ax=axes, shrink=0.8, pad=0.01)
     bar.set_label("residual, %", fontsize=8)
     bar.ax.tick_params(labelsize=8)
+
+
+def overview_figure(result: Findings) -> Figure:
+    """A row for every image: measured, fitted, and the relative residual, mean of all wavelengths."""
+    wavelengths = [float(nm) for nm in result.atmosphere.wavelengths]
+    scale, residuals = residual_scale(result.residuals), result.residuals
+    heights = [observation.used.shape[0] / observation.used.shape[1] for observation in result.observations]
+    figure = Sheet(figsize=(11, 3.4 * sum(heights) + 0.4 * len(heights)), layout="constrained")
+    axes = figure.subplots(len(heights), 3, squeeze=False, height_ratios=heights)
+    for row, observation, fitted, residual in zip(axes, result.observations, result.fitted, residuals, strict=True):
+        pictures = (*developed(observation, fitted, wavelengths), diverging(np.mean(residual, axis=-1), scale))
+        for panel, picture, title in zip(row, pictures, (observation.name, "fitted", "residual"), strict=True):
+            panel.imshow(picture, interpolation="nearest")
+            bare(panel, title)
+    _residual_bar(figure, list(axes[:, 2]), scale)
     return figure
 
 
 def convergence_figure(result: Findings) -> Figure:
     """Reduced χ² and the distance to the optimum against the step; rejected steps are hollow."""
-    figure = Figure(figsize=(6.2, 3.4), layout="constrained")
+    figure = Sheet(figsize=(6.2, 3.4), layout="constrained")
     axes = figure.subplots()
     steps = np.array([step.step for step in result.history])
     chi2 = np.array([step.reduced_chi2 for step in result.history])
@@ -112,7 +149,7 @@ def correlation_figure(result: Findings) -> Figure:
     """Correlation matrix of the fitted numbers."""
     names, matrix = result.fitted_correlation
     size = 2.6 + 0.2 * len(names)
-    figure = Figure(figsize=(size + 0.6, size), layout="constrained")
+    figure = Sheet(figsize=(size + 0.6, size), layout="constrained")
     axes = figure.subplots()
     shown = axes.imshow(np.ma.masked_invalid(matrix), cmap="RdBu_r", vmin=-1, vmax=1)
     axes.set_facecolor(_MASKED)
@@ -124,7 +161,7 @@ def correlation_figure(result: Findings) -> Figure:
 
 def histogram_figure(result: Findings) -> Figure:
     """Distribution of the residuals in sigmas against the normal one they should follow."""
-    figure = Figure(figsize=(6.2, 3.4), layout="constrained")
+    figure = Sheet(figsize=(6.2, 3.4), layout="constrained")
     axes = figure.subplots()
     edges = np.linspace(-6, 6, 61)
     for observation, whitened in zip(result.observations, result.whitened, strict=True):

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from diffatmo.atmosphere import Atmosphere
+from diffatmo.models import Model
 from fitting._errors import FitError
 from fitting.observation import Observation, sigma
 from fitting.priors import Prior
@@ -53,7 +54,8 @@ class Findings:
     """What a fit found. Arrays are NumPy's; ``covariance`` belongs to the numbers named in ``covariance_names``.
 
     Covariances of numbers that the images do not determine are NaN. ``fitted`` are the expected images in the units
-    of the measured ones (NaN outside the fitted region), ``observations`` the images as they were fitted.
+    of the measured ones (NaN outside the fitted region), ``observations`` the images as they were fitted. ``model`` is the one
+    that was fitted, None if it is not known any more; ``refine`` says that its finer self had the last word.
     """
 
     atmosphere: Atmosphere
@@ -75,6 +77,8 @@ class Findings:
     priors: list[Prior] = field(default_factory=list)
     outliers: list[int] = field(default_factory=list)
     """Pixels of each image to which a robust loss gave less than half their weight."""
+    model: Model | None = None
+    refine: bool = True
 
     @property
     def reduced_chi2(self) -> float:

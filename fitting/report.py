@@ -33,12 +33,10 @@
 
 import base64
 import html
-import io
 import json
 import math
 import re
 from collections.abc import Callable, Sequence
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -53,6 +51,7 @@ from diffatmo.render import Scene
 from fitting._errors import FitError
 from fitting.figures import (
     Image,
+    as_png,
     convergence_figure,
     correlation_figure,
     developed,
@@ -63,6 +62,7 @@ from fitting.figures import (
 )
 from fitting.findings import Estimate, Findings
 from fitting.observation import PER_CHANNEL, Observation, exposure_name
+from fitting.storage import installed_version
 from fitting.tables import notes, page_table, table, verdict
 
 __all__ = ["STYLE", "check_writable", "figure_tag", "file_names", "page", "record", "scene_of", "table", "write"]
@@ -201,7 +201,7 @@ def record(result: Findings) -> dict[str, Any]:
         {
             "schema": SCHEMA,
             "schema_version": SCHEMA_VERSION,
-            "version": _version(),
+            "version": installed_version(),
             "converged": result.converged,
             "message": result.message,
             "iterations": result.iterations,
@@ -221,13 +221,6 @@ def record(result: Findings) -> dict[str, Any]:
             "timings": result.timings,
         }
     )
-
-
-def _version() -> str | None:
-    try:
-        return version("diffatmo")
-    except PackageNotFoundError:
-        return None
 
 
 def _sun_degrees(observation: Observation) -> tuple[float, float]:
@@ -311,15 +304,10 @@ def page(result: Findings) -> str:
     return "\n".join(parts)
 
 
-def _embed(figure: Figure) -> str:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=110)
-    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
-
-
 def figure_tag(figure: Figure, caption: str) -> str:
     """A figure as HTML that needs no other file."""
-    return f"<figure><img src='{_embed(figure)}' alt=''><figcaption>{html.escape(caption)}</figcaption></figure>"
+    picture = base64.b64encode(as_png(figure)).decode("ascii")
+    return f"<figure><img src='data:image/png;base64,{picture}' alt=''><figcaption>{html.escape(caption)}</figcaption></figure>"
 
 
 def _caption(observation: Observation, about: dict[str, Any]) -> str:

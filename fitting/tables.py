@@ -1,16 +1,22 @@
 """The numbers of a fit as tables: for a terminal, for a page, for other programs; and in words what must be known of them."""
 
+import csv
 import html
+import io
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from rich.box import SIMPLE_HEAD
+from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from diffatmo import imageio
 from diffatmo.atmosphere import Atmosphere
+from fitting._errors import FitError
 from fitting.findings import Estimate, Findings
 
 FAR = 3.0
@@ -18,6 +24,9 @@ FAR = 3.0
 
 TIED = 0.99999
 """Correlation of numbers that are multiples of each other."""
+
+PLAIN_WIDTH = 90
+"""Columns of the plain text: the table with a truth and a number that is not determined just fits."""
 
 
 def format_number(value: float | None, error: float | None = None) -> str:
@@ -148,3 +157,60 @@ def page_table(result: Findings) -> str:
         line = "".join(f"<td>{cell}</td>" for cell in cells.values())
         lines.append(f"<tr{' class=rule' if rule else ''}>{line}</tr>")
     return "<table>" + "".join(lines) + "</table>"
+
+
+def _remarks(result: Findings) -> list[str]:
+    """What stands below the table: why the fit did not converge, if so, and the notes."""
+    return [f"{result.message}."] * (not result.converged) + notes(result)
+
+
+def text(result: Findings) -> str:
+    """The table and the notes as plain text, for any display."""
+    stream = io.StringIO()
+    console = Console(
+        file=stream, width=PLAIN_WIDTH, color_system=None, force_terminal=False, force_jupyter=False, highlight=False
+    )
+    console.print(table(result), *_remarks(result), sep="\n", markup=False)
+    return "\n".join(line.rstrip() for line in stream.getvalue().rstrip().splitlines())
+
+
+def fragment(result: Findings) -> str:
+    """How the fit ended, the table and the notes as HTML, for a notebook."""
+    lines = [f"<p><strong>{verdict(result)}.</strong></p>", page_table(result)]
+    return "\n".join(lines + [f"<p>{html.escape(note)}</p>" for note in _remarks(result)])
+
+
+def to_rows(result: Findings) -> list[dict[str, Any]]:
+    """One row for each number, with None for what is not known; ``kind`` is ``fitted``, ``derived`` or ``exposure``."""
+    kinds = [("derived" if e.derived else "fitted", e) for e in result.parameters]
+    return [
+        {
+            "name": estimate.name,
+            "kind": kind,
+            "field": estimate.field,
+            "wavelength_nm": estimate.wavelength,
+            "unit": estimate.unit,
+            "value": estimate.value,
+            "standard_error": estimate.standard_error,
+            "initial": estimate.initial,
+            "truth": estimate.truth,
+            "pull": estimate.pull,
+            "at_bound": estimate.at_bound,
+        }
+        for kind, estimate in [*kinds, *(("exposure", e) for e in result.exposures)]
+    ]
+
+
+def write_csv(result: Findings, path: str | Path, *, overwrite: bool = False) -> None:
+    """Write :func:`to_rows` as CSV, numbers with all their digits. Raises :class:`FitError` if it cannot be written."""
+    rows = to_rows(result)
+    try:
+        with (
+            imageio.atomic_write(path, overwrite=overwrite) as temporary,
+            temporary.open("w", encoding="utf-8", newline="") as file,
+        ):
+            writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(rows)
+    except imageio.ImageError as error:
+        raise FitError(str(error)) from error

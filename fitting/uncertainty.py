@@ -91,8 +91,15 @@ def _slopes(y: Coordinates, parameters: Parameters) -> Any:
     return jax.jacfwd(_physical, has_aux=True)(y, parameters)
 
 
-def summarise(solution: Solution, observations: Sequence[Observation], priors: Sequence[Prior] = ()) -> FitResult:
-    """Attach error bars to ``solution``."""
+def summarise(
+    solution: Solution,
+    observations: Sequence[Observation],
+    model: Model,
+    *,
+    priors: Sequence[Prior] = (),
+    refine: bool,
+) -> FitResult:
+    """Attach error bars to ``solution``, which was found with ``model``, and its finer self if ``refine``."""
     parameters = solution.parameters
     count = parameters.size
     wavelengths = [float(nm) for nm in parameters.init.wavelengths]
@@ -152,6 +159,8 @@ def summarise(solution: Solution, observations: Sequence[Observation], priors: S
         priors=list(priors),
         outliers=solution.outliers,
         undetermined=[e.name for e in [*estimates, *factors] if e.standard_error is None],
+        model=model,
+        refine=refine,
     )
 
 
@@ -196,6 +205,7 @@ def fit(
         FitError: The fit cannot be started: a name that is not a parameter, images that do not go together, a model
             that is not finite at the start.
     """
+    model = Moments() if model is None else model
     solution = solve(
         observations,
         init=init,
@@ -203,10 +213,10 @@ def fit(
         tie=tie,
         priors=priors,
         loss=loss,
-        model=Moments() if model is None else model,
+        model=model,
         progress=progress,
         max_steps=max_steps,
         tolerance=tolerance,
         refine=refine,
     )
-    return summarise(solution, observations, priors)
+    return summarise(solution, observations, model, priors=priors, refine=refine)

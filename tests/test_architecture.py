@@ -44,7 +44,7 @@ LEVELS = [
     ["fitting.residuals"],
     ["fitting.solve"],
     ["fitting.findings"],
-    ["fitting.tables", "fitting.figures"],
+    ["fitting.tables", "fitting.figures", "fitting.prediction", "fitting.storage"],
     ["fitting.report", "fitting.result"],
     ["fitting.uncertainty"],
     ["fitting"],
