@@ -264,6 +264,8 @@ def _count(tasks: Sequence[Task]) -> str:
 
 def _work(fitter: Fitter, overwrite: bool, task: Task) -> str | None:
     """Fit one image, in a process of its own; what is wrong if it cannot be fitted."""
+    # The first of several processes would else take the memory of an accelerator for itself.
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     from diffatmo import imageio
 
     try:

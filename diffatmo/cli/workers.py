@@ -79,7 +79,7 @@ class _Worker(NamedTuple):
         self.process.join()
 
 
-def each(work: Callable[[T], R], items: Sequence[T], *, jobs: int) -> Generator[tuple[int, R | Died]]:
+def each(work: Callable[[T], R], items: Sequence[T], *, jobs: int) -> Generator[tuple[int, R | Died], None, None]:
     """The position of each of ``items`` and what ``work`` makes of it, in the order in which they are done.
 
     Up to ``jobs`` processes work at a time; one that dies is replaced. ``work`` must be a function that can be imported;
