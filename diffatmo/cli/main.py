@@ -1,7 +1,7 @@
 """The ``diffatmo`` command: its subcommands, and how it ends.
 
-Exit status: 0 for success, 1 for a fit that did not converge (its best point is written all the same), 2 for bad input,
-reported in one line on the standard error.
+Exit status: 0 for success, 1 for a fit that did not converge (its best point is written all the same) or for images of many
+that could not be fitted, 2 for bad input, reported in one line on the standard error, 130 after Ctrl-C.
 """
 
 import sys
