@@ -215,6 +215,16 @@ CASES = {
     "no noise": (["fit", "GOOD.exr", "--noise", "0", "--noise-floor", "0"], "noise"),
     "no steps": (["fit", "GOOD.exr", "--max-steps", "0"], "--max-steps"),
     "fit by path tracing": (["fit", "GOOD.exr", "--model", "pathtrace"], "pathtrace"),
+    # many fits
+    "folder without images": (["fit", "FOLDER.exr"], "FOLDER.exr: no image in this folder"),
+    "each of nothing": (["fit", "--each"], "--each"),
+    "resume of one fit": (["fit", "GOOD.exr", "--resume"], "--resume"),
+    "jobs of one fit": (["fit", "GOOD.exr", "--jobs", "2"], "--jobs"),
+    "no jobs": (["fit", "GOOD.exr", "--each", "--jobs", "0"], "--jobs"),
+    "resume and overwrite": (["fit", "GOOD.exr", "--each", "--resume", "--overwrite"], "contradict"),
+    "unknown parameter of all": (["fit", "GOOD.exr", "--each", "--free", "mie_gg"], "did you mean 'mie_g'"),
+    "start of all gone": (["fit", "GOOD.exr", "--each", "--init", "gone.toml"], "gone.toml"),
+    "unwritable folder for all": (["fit", "GOOD.exr", "--each", "-o", "/dev/null/out"], "/dev/null/out"),
     # scene files
     "no such scene": (["fit", "--config", "GONE.scene"], "GONE.scene"),
     "scene not TOML": (["fit", "--config", "TOML.scene"], "TOML"),

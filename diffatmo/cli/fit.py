@@ -1,6 +1,5 @@
 """``diffatmo fit``: recover the parameters of an atmosphere from images of its sky."""
 
-import sys
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -9,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from diffatmo.cli import keys, shipped
-from diffatmo.cli.common import InputError, make_model, overwrite_option, read_atmosphere
+from diffatmo.cli import keys, many, shipped
+from diffatmo.cli.common import InputError, make_console, make_model, overwrite_option, printable, read_atmosphere
 from diffatmo.cli.images import observe
 from diffatmo.cli.scenefile import FREE, IMAGE_KEYS, MODELS, FitSpec, ImageSpec, check_image_options, read_scene
 
@@ -20,12 +19,10 @@ if TYPE_CHECKING:
 
 NOT_CONVERGED = 1
 MAX_STEPS = 100
-PLAIN_WIDTH = 120
-"""Columns of the output where it does not go to a terminal."""
 
 
 @click.command()
-@click.argument("images", metavar="[IMAGE]...", nargs=-1, type=click.Path(path_type=Path))
+@click.argument("images", metavar="[IMAGE|FOLDER]...", nargs=-1, type=click.Path(path_type=Path))
 @click.option("--config", metavar="SCENE.toml", type=click.Path(path_type=Path), help="Scene file, instead of images.")
 @click.option(
     "--init", metavar="ATM.toml", help="Where the fit starts: an atmosphere file or a preset.  [default: earth]"
@@ -39,6 +36,14 @@ PLAIN_WIDTH = 120
 @click.option("--model", type=click.Choice(MODELS), help="How the sky is computed.  [default: moments]")
 @click.option("--max-steps", type=click.IntRange(min=1), help="Steps before the fit gives up.  [default: 100]")
 @keys.options(IMAGE_KEYS)
+@click.option("--each", is_flag=True, help="Fit each image on its own, as those of a FOLDER are.")
+@click.option(
+    "--jobs",
+    "processes",
+    type=click.IntRange(min=1),
+    help="Images of a FOLDER fitted at a time; each takes 1 to 2 GB of memory.  [default: one for every two cores, up to 8]",
+)
+@click.option("--resume", is_flag=True, help="Of a FOLDER, fit only what has no complete result yet.")
 @click.option(
     "-o",
     "--output",
@@ -57,6 +62,9 @@ def fit(
     tie: str | None,
     model: str | None,
     max_steps: int | None,
+    each: bool,
+    processes: int | None,
+    resume: bool,
     output: Path,
     overwrite: bool,
     **values: Any,
@@ -67,9 +75,22 @@ def fit(
     scene file says them for each image. Without images or a scene file, the images that come with diffatmo are fitted.
 
     Writes fit.json, atmosphere.toml, pictures of images, fits and residuals, and report.html.
+
+    A FOLDER stands for the images in it, each fitted on its own, several at a time: DIR gets a folder for each image, and
+    results.csv with a row for each. One that cannot be fitted does not stop the others.
     """
     override = {"init": init, "free": _names(free), "tie": _ties(tie), "model": model, "max_steps": max_steps}
-    specs = plan(images, config, keys.given(IMAGE_KEYS, values), output)
+    options = keys.given(IMAGE_KEYS, values)
+    if each or any(image.is_dir() for image in images):
+        if not images and not config:
+            raise InputError("--each: no IMAGE, FOLDER or --config says what to fit")
+        mask = Path(options["mask"]) if "mask" in options else None
+        (spec,) = plan(many.expand(images, mask=mask), config, options, output).values()
+        spec, fitter = spec.override(**override), many.Fitter(prepare, run_quietly)
+        return many.fit_each(spec, output, fitter, jobs=processes, resume=resume, overwrite=overwrite)
+    if resume or processes:
+        raise InputError(f"{'--resume' if resume else '--jobs'} is for the images of a FOLDER, or with --each")
+    specs = plan(images, config, options, output)
     # All that can be wrong is found before the first fit, which is written as soon as it is done.
     jobs = {directory: prepare(spec.override(**override)) for directory, spec in specs.items()}
     from fitting import report
@@ -136,7 +157,7 @@ def prepare(spec: FitSpec) -> Job:
 
 def image_names(images: Sequence[ImageSpec]) -> list[str]:
     """A name for each image: that of its file, and a number where several files have the same."""
-    stems = [image.file.stem for image in images]
+    stems = [printable(image.file.stem) for image in images]
     total, seen = Counter(stems), Counter[str]()
     names = []
     for stem in stems:
@@ -145,17 +166,18 @@ def image_names(images: Sequence[ImageSpec]) -> list[str]:
     return names
 
 
-def run(job: Job, directory: Path, *, overwrite: bool) -> bool:
-    """Fit, write the report, show the table; whether the fit converged."""
-    from rich.console import Console
+def run(job: Job, directory: Path, *, overwrite: bool, quiet: bool = False) -> bool:
+    """Fit, write the report, show the table unless ``quiet``; whether the fit converged."""
+    from rich.text import Text
 
     import fitting
     from diffatmo.models import Bruneton
     from fitting import report
 
-    console = Console(width=None if sys.stdout.isatty() else PLAIN_WIDTH, highlight=False)
+    console = make_console(quiet=quiet)
     count = len(job.observations)
-    console.print(f"\n[bold]{directory.name}[/]: {count} image{'s' * (count > 1)}, free: {', '.join(job.free)}")
+    name = Text(f"\n{printable(directory.name)}", style="bold")
+    console.print(name + f": {count} image{'s' * (count > 1)}, free: {', '.join(job.free)}")
 
     for observation in job.observations:
         if observation.block > 1:
@@ -181,6 +203,14 @@ def run(job: Job, directory: Path, *, overwrite: bool) -> bool:
     console.print(report.table(result, job.truth))
     console.print(f"Report: {directory / 'report.html'}", soft_wrap=True)
     return result.converged
+
+
+def run_quietly(job: Job, directory: Path, overwrite: bool) -> None:
+    """One fit of many: found to be possible to write before it begins, and without a word."""
+    from fitting import report
+
+    report.check_writable(directory, overwrite=overwrite)
+    run(job, directory, overwrite=overwrite, quiet=True)
 
 
 def _names(text: str | None) -> tuple[str, ...] | None:
