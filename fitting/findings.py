@@ -114,9 +114,14 @@ class Findings:
             for o, image in zip(self.observations, self.fitted, strict=True)
         ]
 
+    @property
+    def estimates(self) -> list[Estimate]:
+        """Parameters, derived quantities and exposures, in the order of the covariance."""
+        return [*self.parameters, *self.exposures]
+
     def estimate(self, name: str) -> Estimate:
         """The parameter, derived quantity or exposure called ``name``."""
-        for estimate in [*self.parameters, *self.exposures]:
+        for estimate in self.estimates:
             if estimate.name == name:
                 return estimate
         raise KeyError(name)

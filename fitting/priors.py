@@ -122,7 +122,7 @@ def molecular(init: Atmosphere, *, pressure_hpa: float = 1013.25, temperature_k:
 def ozone(*, latitude_deg: float, longitude_deg: float, day_of_year: int) -> list[Prior]:
     """The column of ozone, from its climatology: Van Heuklon 1979, Solar Energy 22, 63, good to some 10 %.
 
-    For a fit in which ozone is tied to its own spectrum (``ozone_absorption = "dobson"``).
+    Where ozone is not tied to its own spectrum (``"dobson"``), this is a prior on the sum over the wavelengths.
     """
     if not (-90 <= latitude_deg <= 90 and -180 <= longitude_deg <= 180 and 1 <= day_of_year <= 366):
         raise FitError(

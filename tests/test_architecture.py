@@ -44,6 +44,7 @@ LEVELS = [
     ["fitting.residuals"],
     ["fitting.solve"],
     ["fitting.findings"],
+    ["fitting.combinations"],
     ["fitting.tables", "fitting.figures", "fitting.prediction", "fitting.storage"],
     ["fitting.report", "fitting.result"],
     ["fitting.uncertainty"],
@@ -128,9 +129,11 @@ def test_public_names_resolve():
 def test_model_names_of_the_command_line():
     from diffatmo import models
     from diffatmo.models import tables
+    from fitting import robust
 
     assert tuple(models.MODELS) == common.MODELS
     assert set(scenefile.MODELS) == set(models.MODELS) - {"pathtrace"}
+    assert robust.LOSSES == scenefile.LOSSES
     assert export.PARAMETERISATIONS == tables.PARAMETERISATIONS
 
 

@@ -11,11 +11,12 @@ import click
 from diffatmo.cli import keys, many, shipped
 from diffatmo.cli.common import InputError, make_console, make_model, overwrite_option, printable, read_atmosphere
 from diffatmo.cli.images import observe
-from diffatmo.cli.scenefile import FREE, IMAGE_KEYS, MODELS, FitSpec, ImageSpec, check_image_options, read_scene
+from diffatmo.cli.scenefile import FREE, IMAGE_KEYS, LOSSES, MODELS, FitSpec, ImageSpec, check_image_options, read_scene
 
 if TYPE_CHECKING:
     from diffatmo.atmosphere import Atmosphere
-    from fitting import Observation, Step
+    from fitting import Observation, Prior, Step
+    from fitting.parameters import Parameters
 
 NOT_CONVERGED = 1
 MAX_STEPS = 100
@@ -32,6 +33,9 @@ MAX_STEPS = 100
     "--tie",
     metavar="NAME=TIE,...",
     help="How wavelengths hang together: start (keep the ratios of the start), grey, lambda^-4, dobson, mie=angstrom.",
+)
+@click.option(
+    "--loss", type=click.Choice(LOSSES), help="For clouds and objects in the picture, instead of least squares."
 )
 @click.option("--model", type=click.Choice(MODELS), help="How the sky is computed.  [default: moments]")
 @click.option("--max-steps", type=click.IntRange(min=1), help="Steps before the fit gives up.  [default: 100]")
@@ -60,6 +64,7 @@ def fit(
     init: str | None,
     free: str | None,
     tie: str | None,
+    loss: str | None,
     model: str | None,
     max_steps: int | None,
     each: bool,
@@ -79,7 +84,14 @@ def fit(
     A FOLDER stands for the images in it, each fitted on its own, several at a time: DIR gets a folder for each image, and
     results.csv with a row for each. One that cannot be fitted does not stop the others.
     """
-    override = {"init": init, "free": _names(free), "tie": _ties(tie), "model": model, "max_steps": max_steps}
+    override = {
+        "init": init,
+        "free": _names(free),
+        "tie": _ties(tie),
+        "loss": loss,
+        "model": model,
+        "max_steps": max_steps,
+    }
     options = keys.given(IMAGE_KEYS, values)
     if each or any(image.is_dir() for image in images):
         if not images and not config:
@@ -125,6 +137,8 @@ class Job:
     truth: "Atmosphere | None"
     free: tuple[str, ...]
     tie: Mapping[str, str]
+    priors: "list[Prior]"
+    loss: str | None
     model: str
     refine: bool
     max_steps: int
@@ -133,11 +147,14 @@ class Job:
 def prepare(spec: FitSpec) -> Job:
     """Read all that ``spec`` names."""
     from diffatmo.atmosphere import dumps
+    from fitting import priors
     from fitting.parameters import select
 
     init = read_atmosphere(spec.init or "earth")
     free, tie = spec.free if spec.free is not None else FREE, spec.tie or {}
-    select(init, free, tie)
+    parameters = select(init, free, tie)
+    known = [prior for table in spec.priors or () for prior in make_priors(table, parameters)]
+    priors.collect(known, parameters)
     seen = [observe(image, name, init) for image, name in zip(spec.images, image_names(spec.images), strict=True)]
     # Images of different atmospheres have no truth in common.
     truths = {dumps(truth): truth for truth in (image.truth for image in seen) if truth is not None}
@@ -148,11 +165,29 @@ def prepare(spec: FitSpec) -> Job:
         truth=next(iter(truths.values())) if len(truths) == 1 else None,
         free=tuple(free),
         tie=tie,
+        priors=known,
+        loss=spec.loss,
         model=model,
         # A finer model would correct what is not wrong in images that the model itself has made.
         refine=any(image.model != model for image in seen),
         max_steps=spec.max_steps or MAX_STEPS,
     )
+
+
+def make_priors(table: Mapping[str, Any], parameters: "Parameters") -> "list[Prior]":
+    """The priors of one table of a scene file."""
+    from fitting import priors
+
+    said = {key: value for key, value in table.items() if key != "kind"}
+    if table["kind"] == "molecular":
+        return priors.molecular(parameters.init, **said)
+    if table["kind"] == "ozone":
+        return priors.ozone(**(said | {"day_of_year": int(said["day_of_year"])}))
+    if table["kind"] == "aerosol":
+        return priors.aerosol(said["type"], parameters)
+    relative = "relative_error" in said
+    error = said["relative_error" if relative else "error"]
+    return [priors.Prior(said["name"], said["value"], error, relative, "the scene file")]
 
 
 def image_names(images: Sequence[ImageSpec]) -> list[str]:
@@ -194,6 +229,8 @@ def run(job: Job, directory: Path, *, overwrite: bool, quiet: bool = False) -> b
             init=job.init,
             free=job.free,
             tie=job.tie,
+            priors=job.priors,
+            loss=job.loss,
             model=Bruneton.reduced() if job.model == "bruneton" else make_model(job.model),
             progress=show,
             max_steps=job.max_steps,
