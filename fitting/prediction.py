@@ -124,34 +124,47 @@ def predict(result: Findings, scene: Scene, *, model: Model | None = None, expos
     if given.size != len(wavelengths) or not np.allclose(given, wavelengths):
         raise FitError(f"scene: has wavelengths {given.tolist()}, the fit {wavelengths}")
     factors = _factors(result, exposure, wavelengths)
-    slope_model = result.model if model is None else model
-    if slope_model is None:
+    used = result.model if model is None else model
+    if used is None:
         raise FitError("model: that of the fit is not one of diffatmo's own and was not saved with it; give model=")
-    value_model = (result.refine and model is None and slope_model.finer()) or slope_model
     scene = replace(scene, atmosphere=result.atmosphere)
     fitted = [estimate for estimate in result.parameters if not estimate.derived]
     fields = tuple(dict.fromkeys(estimate.field for estimate in fitted))
 
-    compiling = compile_ahead(_value, scene, value_model)
-    slopes = np.asarray(outermost(_slopes)(scene, slope_model, fields), dtype=float)
-    compiling.join()
-    picture = np.asarray(outermost(_value)(scene, value_model), dtype=float)
+    finer = used.finer() if result.refine and model is None else None
+    compiling = compile_ahead(_value, scene, finer) if finer else None
+    picture, slopes = (np.asarray(x, dtype=float) for x in outermost(_linearise)(scene, used, fields))
+    if compiling:
+        compiling.join()
+        picture = np.asarray(outermost(_value)(scene, finer), dtype=float)
     radiance = picture * [factor.value if factor else 1.0 for factor in factors]
+    modes = _modes(result, picture, slopes, fields, factors)
+    return Prediction(scene=scene, radiance=radiance.astype(np.float32), modes=modes)
 
-    numbers = list(dict.fromkeys([*[e.name for e in fitted], *[factor.name for factor in factors if factor]]))
-    index = [result.covariance_names.index(name) for name in numbers]
+
+def _modes(
+    result: Findings,
+    picture: Float[np.ndarray, "height width w"],
+    slopes: Float[np.ndarray, "height width w field"],
+    fields: Sequence[str],
+    factors: Sequence[Estimate | None],
+) -> Float[np.ndarray, "height width w mode"]:
+    """J H, channel by channel: only the numbers of its own wavelength and its exposure touch it."""
+    names = [estimate.name for estimate in result.parameters if not estimate.derived]
+    names += dict.fromkeys(factor.name for factor in factors if factor)
+    index = [result.covariance_names.index(name) for name in names]
     half, determined = _half(result.covariance[np.ix_(index, index)])
     modes = np.empty((*picture.shape, half.shape[1]), dtype=np.float32)
-    for channel, (nm, factor) in enumerate(zip(wavelengths, factors, strict=True)):
-        names = [spectral_name(field, nm) if is_spectral(field) else field for field in fields]
+    for channel, (nm, factor) in enumerate(zip(np.asarray(result.atmosphere.wavelengths), factors, strict=True)):
+        touching = [spectral_name(field, nm) if is_spectral(field) else field for field in fields]
         slope = slopes[:, :, channel]
         if factor:
-            names.append(factor.name)
+            touching.append(factor.name)
             slope = np.concatenate([factor.value * slope, picture[:, :, channel, None]], axis=-1)
-        touching = [numbers.index(name) for name in names]
-        modes[:, :, channel] = slope @ half[touching]
-        modes[np.any(slope[..., ~determined[touching]] != 0, axis=-1), channel] = np.nan
-    return Prediction(scene=scene, radiance=radiance.astype(np.float32), modes=modes)
+        rows = [names.index(name) for name in touching]
+        modes[:, :, channel] = slope @ half[rows]
+        modes[np.any(slope[..., ~determined[rows]] != 0, axis=-1), channel] = np.nan
+    return modes
 
 
 def _factors(result: Findings, name: str | None, wavelengths: Sequence[float]) -> list[Estimate | None]:
@@ -169,19 +182,22 @@ def _value(scene: Scene, model: Model) -> Float[Array, "height width w"]:
     return render.render(scene, model)
 
 
-def _slopes(scene: Scene, model: Model, fields: tuple[str, ...]) -> Float[Array, "height width w field"]:
-    """Derivative of every pixel and channel in each field: in its number at that wavelength, if the field is a spectrum."""
+def _linearise(
+    scene: Scene, model: Model, fields: tuple[str, ...]
+) -> tuple[Float[Array, "height width w"], Float[Array, "height width w field"]]:
+    """The picture, and its derivative in each field: in the number of that channel, if the field is a spectrum."""
     values = [getattr(scene.atmosphere, field) for field in fields]
 
     def picture(values: list[Array]) -> Array:
         air = eqx.tree_at(lambda a: [getattr(a, field) for field in fields], scene.atmosphere, values)
         return render.render(replace(scene, atmosphere=air), model)
 
-    def along(seed: Float[Array, " field"]) -> Array:
+    def along(seed: Float[Array, " field"]) -> tuple[Array, Array]:
         tangents = [jnp.full_like(value, share) for value, share in zip(values, seed, strict=True)]
-        return jax.jvp(picture, (values,), (tangents,))[1]
+        value, slope = jax.jvp(picture, (values,), (tangents,))
+        return value, slope
 
-    return jax.vmap(along, out_axes=-1)(jnp.eye(len(fields), dtype=values[0].dtype))
+    return jax.vmap(along, out_axes=(None, -1))(jnp.eye(len(fields), dtype=values[0].dtype))
 
 
 def _half(covariance: Float[np.ndarray, "q q"]) -> tuple[Float[np.ndarray, "q mode"], np.ndarray]:
