@@ -21,9 +21,11 @@ from the fitted one.
 
 import math
 import time
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -37,6 +39,7 @@ from diffatmo.atmosphere import Atmosphere
 from diffatmo.compiling import compile_ahead, outermost
 from diffatmo.models.base import Model
 from fitting._errors import FitError
+from fitting.checkpoint import Checkpoint, digest, load, save
 from fitting.observation import Batch, Observation, exposures, sigma, stack
 from fitting.parameters import Coordinates, Parameters, select
 from fitting.priors import Prior, collect
@@ -293,8 +296,13 @@ def _minimise(
     max_steps: int,
     history: list[Step],
     progress: Progress | None,
+    keep: Callable[[Coordinates, float], None],
+    step_size: float | None = None,
 ) -> _Point:
-    """Levenberg-Marquardt from ``y``, where the model is linearised already, until ``history`` holds ``max_steps``."""
+    """Levenberg-Marquardt from ``y``, where the model is linearised already, until ``history`` holds ``max_steps``.
+
+    ``keep`` is given the best point and the step size after every step; ``step_size`` is that of the first one.
+    """
     state = outermost(_start)(y)
     limits = jax.tree.map(np.asarray, problem.limits)
     freedom = max(_count(problem.batch) - y.size, 1)
@@ -313,15 +321,16 @@ def _minimise(
             else:
                 # An infinitely bad point, in numbers whose squares do not overflow: the step is rejected and shortened.
                 chi2, held = math.inf, np.diag([0.0] * y.size + [1e15])
-            step_size = state.search_state.step_size
+            size = state.search_state.step_size
             if best is None:
+                size = size if step_size is None else jnp.full_like(size, step_size)
                 misfit = scale = max(1.0, chi2 / freedom)
             elif chi2 < best.chi2:
                 # The damping follows the misfit: with λ = 1 a step is restrained to about a natural unit in directions
                 # that the data, given residuals of the present size, determine no better than that.
                 previous, misfit = misfit, max(1.0, chi2 / freedom)
-                step_size = step_size * (previous / misfit)
-            state = eqx.tree_at(lambda s: (s.y_eval, s.search_state.step_size), state, (trial, step_size))
+                size = size * (previous / misfit)
+            state = eqx.tree_at(lambda s: (s.y_eval, s.search_state.step_size), state, (trial, size))
             change = float(np.max(np.abs(np.asarray(trial) - np.asarray(y))))
             plane = jnp.asarray(held / math.sqrt(scale), dtype=y.dtype)
             y, state = outermost(_step)(y, state, (plane[:, -1], plane[:, :-1], trial))
@@ -342,6 +351,7 @@ def _minimise(
                     seconds=time.perf_counter() - started,
                 )
             )
+            keep(best.y, float(state.search_state.step_size))
             if progress is not None:
                 progress(history[-1])
             if np.array_equal(outermost(_shorten)(y, state.y_eval, limits), y):
@@ -458,6 +468,7 @@ def solve(
     max_steps: int = MAX_STEPS,
     tolerance: float = TOLERANCE,
     refine: bool = True,
+    checkpoint: Path | None = None,
 ) -> Solution:
     """Find the atmosphere that explains ``observations``; see :func:`fitting.fit`, which adds the error bars.
 
@@ -470,6 +481,11 @@ def solve(
         raise FitError(f"tolerance: got {tolerance}, expected a number > 0")
     started = time.perf_counter()
     parameters = select(init, free, tie)
+    # A checkpoint that does not belong here is found before anything is computed.
+    saved, identity = None, ""
+    if checkpoint is not None:
+        identity = digest(list(observations), init, list(free), dict(tie or {}), list(priors), loss, model, refine)
+        saved = load(checkpoint, identity)
     wavelengths = [float(nm) for nm in init.wavelengths]
     batch = stack(observations, wavelengths)
     names, _ = exposures(observations, wavelengths)
@@ -499,27 +515,48 @@ def solve(
         seconds.append(time.perf_counter() - before)
         return result
 
-    start = evaluate(parameters.start, problem)
+    coordinates = parameters.start if saved is None else jnp.asarray(saved.y[: parameters.size], parameters.start.dtype)
+    start = evaluate(coordinates, problem)
     _check_finite(start, batch, [observation.name for observation in observations])
-    log_factors = jnp.asarray(_starting_exposures(np.asarray(start.radiance), batch), parameters.start.dtype)
-    history: list[Step] = []
-    search = partial(_minimise, evaluate=evaluate, max_steps=max_steps, history=history, progress=progress)
+    log_factors = (
+        _starting_exposures(np.asarray(start.radiance), batch) if saved is None else saved.y[parameters.size :]
+    )
+    history = [Step(**row) for row in saved.history] if saved is not None else []
+    final = saved is not None and saved.final
+
+    def keep(y: Coordinates, step_size: float) -> None:
+        nonlocal checkpoint
+        if checkpoint is not None:
+            try:
+                rows = [step._asdict() for step in history]
+                save(checkpoint, identity, Checkpoint(np.asarray(y), step_size, final, rows))
+            except FitError as error:
+                warnings.warn(f"{error}; the fit goes on without a checkpoint", stacklevel=2)
+                checkpoint = None
+
+    search = partial(_minimise, evaluate=evaluate, max_steps=max_steps, history=history, progress=progress, keep=keep)
     rough = max(tolerance, FIRST_PASS_TOLERANCE)
-    y, scales = jnp.concatenate([parameters.start, log_factors]), [math.inf]
-    while True:
+    # A search that goes on has the step size that it had, any other begins with its own.
+    step_size = None if saved is None else saved.step_size
+    y, scales = jnp.concatenate([coordinates, jnp.asarray(log_factors, coordinates.dtype)]), [math.inf]
+    interrupted = False
+    while not final:
         problem = _rescaled(y, start, problem)
-        best = search(y, start, problem, tolerance=rough)
+        best = search(y, start, problem, tolerance=rough, step_size=step_size)
+        step_size = None
         y, start = best.y, best.linearisation
-        if best.message == INTERRUPTED or problem.loss is None:
+        interrupted = best.message == INTERRUPTED
+        if interrupted or problem.loss is None:
             break
         # While the fit gets better, fewer pixels pass for outliers.
         scales.append(float(problem.loss.scale))
         if scales[-1] == 1 or scales[-1] > SETTLED * scales[-2]:
             break
-    if best.message != INTERRUPTED:
+    if not interrupted:
+        final = True
         problem = outermost(_weigh)(problem, outermost(_expected)(y, start, problem))
         problem = _rescaled(y, start, problem)
-        best = search(y, start, problem, tolerance=tolerance)
+        best = search(y, start, problem, tolerance=tolerance, step_size=step_size)
     model_error = np.zeros((size, size))
     if finer is not None and best.converged:
         coordinates, radiance = best.y[: parameters.size], best.linearisation.radiance

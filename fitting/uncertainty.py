@@ -18,6 +18,7 @@ and neither leaves room for more confidence.
 
 import math
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -177,6 +178,7 @@ def fit(
     max_steps: int = MAX_STEPS,
     tolerance: float = TOLERANCE,
     refine: bool = True,
+    checkpoint: Path | None = None,
 ) -> FitResult:
     """Recover an atmosphere's parameters from images of its sky, with error bars.
 
@@ -197,6 +199,8 @@ def fit(
         tolerance: Distance to the optimum, in standard errors, at which it is found.
         refine: Whether the last steps explain the images by the model's ``finer`` self, if it has one, and the error bars
             take in what that may leave of the model's error. False fits images that ``model`` itself has made.
+        checkpoint: A file that holds the best point after every step, and from which the same fit goes on if it exists. It
+            is left for the caller to remove.
 
     Returns:
         The best point found; ``converged`` and ``message`` say whether it is the optimum and why the fit stopped.
@@ -218,5 +222,6 @@ def fit(
         max_steps=max_steps,
         tolerance=tolerance,
         refine=refine,
+        checkpoint=checkpoint,
     )
     return summarise(solution, observations, model, priors=priors, refine=refine)

@@ -40,7 +40,7 @@ LEVELS = [
     ["fitting._errors"],
     ["fitting.bijections", "fitting.quantities"],
     ["fitting.parameters", "fitting.observation"],
-    ["fitting.priors", "fitting.robust"],
+    ["fitting.priors", "fitting.robust", "fitting.checkpoint"],
     ["fitting.residuals"],
     ["fitting.solve"],
     ["fitting.findings"],

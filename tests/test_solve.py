@@ -110,6 +110,53 @@ def test_progress_sees_every_step():
     assert seen[-1].distance < 0.1
 
 
+def test_a_fit_goes_on_from_its_checkpoint(tmp_path):
+    """Killed after any step, it needs no more steps in all than one more, and finds the same."""
+    whole, file = toy_sky.result(), tmp_path / "checkpoint.npz"
+    settings = {"init": toy_sky.start(), "free": FREE, "model": Toy(), "checkpoint": file}
+
+    class Killed(Exception):
+        pass
+
+    for last in (0, 3, whole.history[-1].step):
+
+        def kill(step, last=last):
+            if step.step == last:
+                raise Killed
+
+        file.unlink(missing_ok=True)
+        with pytest.raises(Killed):
+            fit(toy_sky.observations(), **settings, progress=kill)
+        seen = []
+        found = fit(toy_sky.observations(), **settings, progress=seen.append)
+        assert found.converged
+        assert seen[0].step == last + 1
+        assert found.history[: last + 1] == found.history[: len(found.history) - len(seen)]
+        # The point where it was is evaluated once more, and the damping found anew.
+        assert len(found.history) <= len(whole.history) + 4
+        for ours, best in zip(found.parameters, whole.parameters, strict=True):
+            assert ours.value == pytest.approx(best.value, abs=0.1 * best.standard_error)
+
+
+def test_a_checkpoint_of_another_fit_is_refused(tmp_path):
+    file = tmp_path / "checkpoint.npz"
+    settings = {"init": toy_sky.start(), "model": Toy(), "checkpoint": file}
+    fit(toy_sky.observations(), free=["mie_g"], **settings)
+    for images, free in ((toy_sky.observations(), ["mie_scattering"]), (toy_sky.observations(seed=1), ["mie_g"])):
+        with pytest.raises(FitError, match="belongs to a fit of other images or options"):
+            fit(images, free=free, **settings)
+    file.write_bytes(file.read_bytes()[:100])
+    with pytest.raises(FitError, match="not a checkpoint of a fit"):
+        fit(toy_sky.observations(), free=["mie_g"], **settings)
+
+
+def test_a_full_disk_does_not_stop_a_fit(tmp_path):
+    settings = {"init": toy_sky.start(), "free": ["mie_g"], "model": Toy()}
+    with pytest.warns(UserWarning, match="goes on without a checkpoint"):
+        found = fit(toy_sky.observations(), **settings, checkpoint=tmp_path / "gone" / "checkpoint.npz")
+    assert found.iterations > 1
+
+
 class Cliff(Toy):
     """A model that has no answer for forward peaks sharper than 0.95."""
 

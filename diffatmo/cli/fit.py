@@ -47,7 +47,11 @@ MAX_STEPS = 100
     type=click.IntRange(min=1),
     help="Images of a FOLDER fitted at a time; each takes 1 to 2 GB of memory.  [default: one for every two cores, up to 8]",
 )
-@click.option("--resume", is_flag=True, help="Of a FOLDER, fit only what has no complete result yet.")
+@click.option(
+    "--resume",
+    is_flag=True,
+    help="Go on with a fit that was broken off; of a FOLDER, fit only what has no complete result.",
+)
 @click.option(
     "-o",
     "--output",
@@ -100,17 +104,34 @@ def fit(
         (spec,) = plan(many.expand(images, mask=mask), config, options, output).values()
         spec, fitter = spec.override(**override), many.Fitter(prepare, run_quietly)
         return many.fit_each(spec, output, fitter, jobs=processes, resume=resume, overwrite=overwrite)
-    if resume or processes:
-        raise InputError(f"{'--resume' if resume else '--jobs'} is for the images of a FOLDER, or with --each")
+    if processes:
+        raise InputError("--jobs is for the images of a FOLDER, or with --each")
     specs = plan(images, config, options, output)
     # All that can be wrong is found before the first fit, which is written as soon as it is done.
     jobs = {directory: prepare(spec.override(**override)) for directory, spec in specs.items()}
     from fitting import report
 
+    begun = {directory: check_begun(directory, resume=resume, overwrite=overwrite) for directory in jobs}
     for directory in jobs:
-        report.check_writable(directory, overwrite=overwrite)
-    converged = [run(job, directory, overwrite=overwrite) for directory, job in jobs.items()]
+        report.check_writable(directory, overwrite=overwrite or begun[directory])
+    converged = [run(job, directory, overwrite=overwrite or begun[directory]) for directory, job in jobs.items()]
     return 0 if all(converged) else NOT_CONVERGED
+
+
+def check_begun(directory: Path, *, resume: bool, overwrite: bool) -> bool:
+    """Whether an unfinished fit goes on in ``directory``; refuses one that is neither to go on nor to be replaced."""
+    from fitting import checkpoint
+
+    file = directory / checkpoint.FILE
+    if not file.exists():
+        return False
+    if overwrite:
+        file.unlink()
+    elif not resume:
+        raise InputError(
+            f"{file}: a fit was broken off here; give --resume to go on with it, or --overwrite to begin anew"
+        )
+    return not overwrite
 
 
 def plan(images: Sequence[Path], config: Path | None, options: Mapping[str, Any], output: Path) -> dict[Path, FitSpec]:
@@ -207,9 +228,13 @@ def run(job: Job, directory: Path, *, overwrite: bool, quiet: bool = False) -> b
 
     import fitting
     from diffatmo.models import Bruneton
-    from fitting import report
+    from fitting import checkpoint, report
+    from fitting.solve import INTERRUPTED
 
     console = make_console(quiet=quiet)
+    file = directory / checkpoint.FILE
+    if file.exists():
+        console.print(f"Going on from {printable(file)}")
     count = len(job.observations)
     name = Text(f"\n{printable(directory.name)}", style="bold")
     console.print(name + f": {count} image{'s' * (count > 1)}, free: {', '.join(job.free)}")
@@ -235,17 +260,21 @@ def run(job: Job, directory: Path, *, overwrite: bool, quiet: bool = False) -> b
             progress=show,
             max_steps=job.max_steps,
             refine=job.refine,
+            checkpoint=file,
         )
         report.write(result, directory, truth=job.truth, overwrite=overwrite)
+    if result.message != INTERRUPTED:
+        file.unlink(missing_ok=True)
     console.print(report.table(result, job.truth))
     console.print(f"Report: {directory / 'report.html'}", soft_wrap=True)
     return result.converged
 
 
 def run_quietly(job: Job, directory: Path, overwrite: bool) -> None:
-    """One fit of many: found to be possible to write before it begins, and without a word."""
-    from fitting import report
+    """One fit of many: found to be possible to write before it begins, and without a word. It does not go on from another."""
+    from fitting import checkpoint, report
 
+    (directory / checkpoint.FILE).unlink(missing_ok=True)
     report.check_writable(directory, overwrite=overwrite)
     run(job, directory, overwrite=overwrite, quiet=True)
 

@@ -1,0 +1,76 @@
+"""The best point of a fit that is still running, on disk, so that a killed run loses one step.
+
+The file is NumPy's ``.npz`` without pickles and always whole. It says which fit it belongs to by a digest of the images and of
+everything said about the fit; another fit refuses it.
+"""
+
+import hashlib
+import json
+import tokenize
+import zipfile
+import zlib
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from diffatmo import imageio
+from fitting._errors import FitError
+
+FILE = "checkpoint.npz"
+
+_DAMAGED = (ValueError, KeyError, TypeError, EOFError, SyntaxError, tokenize.TokenError, zipfile.BadZipFile, zlib.error)
+
+
+class Checkpoint(NamedTuple):
+    """Where a fit stands."""
+
+    y: Float[np.ndarray, " n"]
+    """The best point of the present stage."""
+    step_size: float
+    """Inverse of the damping of the next step."""
+    final: bool
+    """Whether sigma comes from the fitted signal already."""
+    history: list[dict[str, Any]]
+    """A row for each step."""
+
+
+def digest(*parts: Any) -> str:
+    """What tells one fit from another: of arrays their bytes, of everything else its text."""
+    leaves, structure = jax.tree.flatten(parts)
+    found = hashlib.sha256(str(structure).encode())
+    for leaf in leaves:
+        array = isinstance(leaf, np.ndarray | jax.Array)
+        found.update(np.asarray(leaf).tobytes() if array else repr(leaf).encode())
+    return found.hexdigest()
+
+
+def save(path: Path, fit: str, checkpoint: Checkpoint) -> None:
+    """Replace the file at ``path``. Raises :class:`FitError` if it cannot be written."""
+    record = json.dumps(
+        {"fit": fit, "step_size": checkpoint.step_size, "final": checkpoint.final, "history": checkpoint.history}
+    )
+    try:
+        with imageio.atomic_write(path, overwrite=True) as temporary, temporary.open("wb") as file:
+            np.savez(file, allow_pickle=False, y=checkpoint.y, record=np.frombuffer(record.encode(), np.uint8))
+    except imageio.ImageError as error:
+        raise FitError(str(error)) from error
+
+
+def load(path: Path, fit: str) -> Checkpoint | None:
+    """The checkpoint at ``path``, None if there is none; raises :class:`FitError` if it is of another fit or damaged."""
+    if not path.exists():
+        return None
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+            y, record = archive["y"], json.loads(archive["record"].tobytes())
+        owner, checkpoint = record["fit"], Checkpoint(y, record["step_size"], record["final"], record["history"])
+    except OSError as error:
+        raise FitError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except _DAMAGED as error:
+        raise FitError(f"{path}: not a checkpoint of a fit; remove it to start anew") from error
+    if owner != fit:
+        raise FitError(f"{path}: belongs to a fit of other images or options; remove it to start anew")
+    return checkpoint
