@@ -77,9 +77,10 @@ def luminance(rgb: Float[Array, "... 3"]) -> Float[Array, "..."]:
 def auto_exposure(rgb: Float[Array, "... 3"], *, percentile: float = 90.0, level: float = 1.0) -> Float[Array, ""]:
     """The factor that brings the given percentile of luminance to ``level``; 1 for a picture that is black there.
 
-    ``level`` = 1 comes out of :func:`tone_map` as 63 % of white. A percentile keeps the sun from deciding.
+    ``level`` = 1 comes out of :func:`tone_map` as 63 % of white. A percentile keeps the sun from deciding. Pixels that are
+    NaN do not count.
     """
-    reference = jnp.percentile(luminance(rgb).ravel(), percentile)
+    reference = jnp.nanpercentile(luminance(rgb).ravel(), percentile)
     lit = reference > 0
     return jnp.where(lit, level / jnp.where(lit, reference, 1), 1.0)
 

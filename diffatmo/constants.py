@@ -19,3 +19,12 @@ DOBSON_UNIT = 2.6867e20
 
 LOSCHMIDT = 2.546899e25
 """Molecules per cubic metre of air at 288.15 K and 1013.25 hPa (Bodhaine et al. 1999, eq. 6 ff.)."""
+
+GAS_CONSTANT = 8.314462618
+"""J mol^-1 K^-1 (CODATA 2018, exact)."""
+
+MOLAR_MASS_AIR = 0.0289644
+"""Of dry air, kg mol^-1 (US Standard Atmosphere 1976)."""
+
+GRAVITY = 9.80665
+"""Standard acceleration of free fall, m s^-2."""

@@ -9,12 +9,13 @@
     fitting.report.write(result, "out")
 """
 
-from fitting import report
+from fitting import priors, report
 from fitting._errors import FitError
 from fitting.findings import Estimate
 from fitting.observation import Observation, observe
 from fitting.parameters import FREE_FIELDS
 from fitting.prediction import Prediction
+from fitting.priors import Prior
 from fitting.result import FitResult
 from fitting.solve import Step
 from fitting.uncertainty import fit
@@ -26,8 +27,10 @@ __all__ = [
     "FitResult",
     "Observation",
     "Prediction",
+    "Prior",
     "Step",
     "fit",
     "observe",
+    "priors",
     "report",
 ]

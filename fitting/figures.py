@@ -44,7 +44,8 @@ def developed(
 ) -> tuple[Float[np.ndarray, "height width 3"], Float[np.ndarray, "height width 3"]]:
     """The measured and the fitted image for a screen, through the same exposure and tone curve."""
     bands = jnp.asarray(wavelengths)
-    used = jnp.asarray(observation.image[observation.used])
+    # In the shape of the image, whatever pixels are used, so that images of one size share one compiled program.
+    used = jnp.asarray(np.where(observation.used[..., None], observation.image, np.nan))
     exposure = color.auto_exposure(color.to_linear_srgb(used, wavelengths=bands))
 
     def develop(image: Image) -> Float[np.ndarray, "height width 3"]:

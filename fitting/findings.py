@@ -14,6 +14,7 @@ from diffatmo.atmosphere import Atmosphere
 from diffatmo.models import Model
 from fitting._errors import FitError
 from fitting.observation import Observation, sigma
+from fitting.priors import Prior
 from fitting.quantities import numbers
 from fitting.solve import Step
 
@@ -37,6 +38,8 @@ class Estimate:
     truth: float | None = None
     derived: bool = False
     at_bound: bool = False
+    data_share: float | None = None
+    """The part of its precision that comes from the images, not from priors."""
 
     @property
     def pull(self) -> float | None:
@@ -71,6 +74,9 @@ class Findings:
     observations: list[Observation]
     fitted: list[Float[np.ndarray, "height width w"]]
     undetermined: list[str] = field(default_factory=list)
+    priors: list[Prior] = field(default_factory=list)
+    outliers: list[int] = field(default_factory=list)
+    """Pixels of each image to which a robust loss gave less than half their weight."""
     model: Model | None = None
     refine: bool = True
 
@@ -108,9 +114,14 @@ class Findings:
             for o, image in zip(self.observations, self.fitted, strict=True)
         ]
 
+    @property
+    def estimates(self) -> list[Estimate]:
+        """Parameters, derived quantities and exposures, in the order of the covariance."""
+        return [*self.parameters, *self.exposures]
+
     def estimate(self, name: str) -> Estimate:
         """The parameter, derived quantity or exposure called ``name``."""
-        for estimate in [*self.parameters, *self.exposures]:
+        for estimate in self.estimates:
             if estimate.name == name:
                 return estimate
         raise KeyError(name)

@@ -19,14 +19,17 @@
 ``error_scale``       factor √(reduced χ²) >= 1 that the standard errors contain
 ``wavelengths_nm``    the order of all lists of one number per wavelength
 ``parameters``        name of the field → ``unit``, ``value``, ``standard_error`` (null: not determined by the images),
+                      ``data_share`` (the part of its precision that comes from the images, not from priors),
                       ``initial``, ``truth`` (null: unknown), ``pull`` = (value - truth) / standard_error, ``at_bound``;
                       each a number, or a list for a spectral field
 ``derived``           the same for optical depths and single scattering albedo
 ``exposures``         the same for the free exposure factors
+``priors``            ``name``, ``value``, ``error``, ``relative`` (of the logarithm), ``source`` of each
 ``undetermined``      names of the numbers that the images do not determine
 ``covariance``        ``names`` and ``matrix`` (of all numbers above), ``correlation`` likewise
-``images``            for each: place, sun, exposure, masked pixels by reason, and ``residuals``: per wavelength the
-                      median and the root mean square of measured / fitted - 1, and the root mean square in sigmas
+``images``            for each: place, sun, exposure, masked pixels by reason, pixels that a robust loss takes for
+                      outliers, and ``residuals``: per wavelength the median and the root mean square of
+                      measured / fitted - 1, and the root mean square in sigmas
 ``timings``           seconds: ``compile_s``, ``solve_s``, ``total_s``
 ====================  ================================================================================================
 """
@@ -37,6 +40,7 @@ import json
 import math
 import re
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -186,7 +190,7 @@ def _by_field(estimates: Sequence[Estimate]) -> dict[str, dict[str, Any]]:
     fields: dict[str, list[Estimate]] = {}
     for estimate in estimates:
         fields.setdefault(estimate.field, []).append(estimate)
-    keys = ("value", "standard_error", "initial", "truth", "pull", "at_bound")
+    keys = ("value", "standard_error", "data_share", "initial", "truth", "pull", "at_bound")
     result: dict[str, dict[str, Any]] = {}
     for field, members in fields.items():
         columns = {key: [getattr(member, key) for member in members] for key in keys}
@@ -214,6 +218,7 @@ def record(result: Findings) -> dict[str, Any]:
             "derived": _by_field([e for e in result.parameters if e.derived]),
             "exposures": _by_field(result.exposures),
             "undetermined": result.undetermined,
+            "priors": [asdict(prior) for prior in result.priors],
             "covariance": {"names": result.covariance_names, "matrix": result.covariance},
             "correlation": {"names": result.covariance_names, "matrix": result.correlation},
             "images": [_image_record(result, number) for number in range(len(result.observations))],
@@ -243,6 +248,7 @@ def _image_record(result: Findings, number: int) -> dict[str, Any]:
         "exposure_value": observation.exposure_value,
         "pixels_used": len(relative),
         "pixels_masked": observation.masked,
+        "pixels_outlying": result.outliers[number] if result.outliers else 0,
         "binning": observation.block,
         "residuals": {
             "median_relative": np.median(relative, axis=0),
@@ -315,9 +321,10 @@ def _caption(observation: Observation, about: dict[str, Any]) -> str:
     median = ", ".join(f"{100 * value:.2g}" for value in about["residuals"]["median_absolute_relative"])
     of_sigma = ", ".join(f"{value:.2g}" for value in about["residuals"]["rms_sigma"])
     binned = f" (blocks of {observation.block} × {observation.block})" if observation.block > 1 else ""
+    outlying = f" ({about['pixels_outlying']} of them outliers)" if about["pixels_outlying"] else ""
     return (
         f"{observation.name}: sun at zenith angle {about['sun_zenith_deg']:.1f}°, azimuth "
         f"{about['sun_azimuth_deg']:.1f}°; altitude {observation.altitude:g} km; exposure {observation.exposure}; "
-        f"{about['pixels_used']} pixels used{binned}{f', left out: {masked}' if masked else ''}. "
+        f"{about['pixels_used']} pixels used{binned}{outlying}{f', left out: {masked}' if masked else ''}. "
         f"Median |residual| per wavelength: {median} %; residual over stated noise, RMS: {of_sigma}."
     )

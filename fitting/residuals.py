@@ -20,6 +20,8 @@ from jaxtyping import Array, Float
 from diffatmo.models import Model, Moments, Sky
 from fitting.observation import Batch
 from fitting.parameters import Coordinates, Parameters
+from fitting.priors import Priors
+from fitting.robust import Loss
 
 Predicted = Float[Array, "image pixel w"]
 
@@ -29,7 +31,8 @@ class Problem(eqx.Module):
 
     ``weight`` is 1/sigma, and 0 for pixels that are not used; ``shell`` is what the model knows of the planet alone, if
     it makes use of that and the planet is not free. ``correction`` is what a finer model says, over what this one says, at
-    one point near the optimum; it scales the radiance and its derivatives.
+    one point near the optimum; it scales the radiance and its derivatives. ``loss`` is what outliers are given, if they are
+    not given their squares.
     """
 
     model: Model
@@ -38,6 +41,8 @@ class Problem(eqx.Module):
     weight: Predicted
     shell: Any = None
     correction: Predicted | None = None
+    priors: Priors | None = None
+    loss: Loss | None = None
 
     def sky(self, coordinates: Coordinates) -> Sky:
         """The sky at coordinates of the atmosphere."""
@@ -132,6 +137,12 @@ def jacobian(
     return _whiten(expected, problem).reshape(-1), slope.reshape(-1, y.size)
 
 
+def whitened(y: Coordinates, linearisation: Linearisation, problem: Problem) -> Predicted:
+    """(expected - measured) / sigma of every pixel and channel; 0 for those not used."""
+    expected = linearisation.radiance * problem.batch.exposure(problem.split(y)[1])
+    return _whiten(expected, problem)
+
+
 def smooth_fields(batch: Batch, degree: int) -> Float[np.ndarray, "image pixel b"]:
     """Polynomials of the view direction, orthogonal over the used pixels of each image, of mean square one there.
 
@@ -162,3 +173,30 @@ def triangle(residual: Float[Array, " residual"], slope: Float[Array, "residual 
     not square the condition number, which in float32 decides whether a weakly determined parameter is seen at all.
     """
     return jnp.linalg.qr(jnp.concatenate([slope, residual[:, None]], axis=-1), mode="r")
+
+
+def reduce(y: Coordinates, linearisation: Linearisation, problem: Problem) -> Float[Array, "n+1 n+1"]:
+    """The triangular factor of the whole problem at ``y``: the images with their loss, and the priors."""
+    residual, slope = jacobian(y, linearisation, problem)
+    beyond: Float[Array, ""] | float = 0.0
+    if problem.loss is not None:
+        whitened = residual.reshape(linearisation.radiance.shape)
+        weight, total = problem.loss(whitened)
+        root = jnp.broadcast_to(jnp.sqrt(weight)[..., None], whitened.shape).reshape(-1)
+        residual, slope = root * residual, root[:, None] * slope
+        # The squares of the weighted residuals are less than the loss, whose gradient they have.
+        beyond = total - jnp.sum(residual**2)
+    if problem.priors is not None:
+        known, pull = prior_rows(y, problem.priors, problem)
+        residual, slope = jnp.concatenate([residual, known]), jnp.concatenate([slope, pull])
+    factor = triangle(residual, slope)
+    return factor.at[-1, -1].set(jnp.sqrt(factor[-1, -1] ** 2 + jnp.maximum(beyond, 0)))
+
+
+def prior_rows(y: Coordinates, priors: Priors, problem: Problem) -> tuple[Float[Array, " k"], Float[Array, "k n"]]:
+    """Residuals of the priors and their derivatives."""
+
+    def of(y: Coordinates) -> Float[Array, " k"]:
+        return priors.residuals(problem.parameters.atmosphere(problem.split(y)[0]))
+
+    return of(y), jax.jacfwd(of)(y)

@@ -39,6 +39,7 @@ from diffatmo.models.base import Model
 from fitting._errors import FitError
 from fitting.observation import Batch, Observation, exposures, sigma, stack
 from fitting.parameters import Coordinates, Parameters, select
+from fitting.priors import Prior, collect
 from fitting.residuals import (
     Linearisation,
     Predicted,
@@ -47,10 +48,13 @@ from fitting.residuals import (
     linearise,
     planet_shell,
     predict,
+    prior_rows,
     projected,
+    reduce,
     smooth_fields,
-    triangle,
+    whitened,
 )
+from fitting.robust import Loss, scale
 
 TOLERANCE = 0.1
 """Distance to the optimum, in standard errors, at which the fit has converged."""
@@ -94,6 +98,9 @@ model's error is understated."""
 
 FIELD_DEGREE = 3
 """Degree in direction up to which the model's errors are correlated."""
+
+SETTLED = 0.9
+"""Ratio of the scales of a robust loss, from one stage to the next, above which it does not fall any further."""
 
 RANK_TOLERANCE = 3e-5
 """Singular values of J, scaled to columns of length one, below this are rounding: J is computed in float32."""
@@ -154,11 +161,19 @@ class Solution(NamedTuple):
     converged: bool
     message: str
     timings: dict[str, float]
+    of_images: Float[np.ndarray, "n+1 n+1"]
+    """The triangular factor of the images alone."""
+    of_priors: Float[np.ndarray, "k n"]
+    """The derivatives of the priors' residuals."""
+    inflation: float | None
+    """What a robust loss makes of the covariance (:meth:`fitting.robust.Loss.inflation`)."""
+    outliers: list[int]
+    """Pixels of each image to which a robust loss gives less than half their weight."""
 
     @property
     def chi2(self) -> float:
-        """Sum of the squared whitened residuals."""
-        return float(np.sum(self.triangle[:, -1] ** 2))
+        """Sum of the squared whitened residuals of the images, or of what a robust loss makes of them."""
+        return float(np.sum(self.of_images[:, -1] ** 2))
 
     @property
     def degrees_of_freedom(self) -> int:
@@ -209,10 +224,6 @@ def _model_error(best: "_Point", problem: Problem) -> Float[np.ndarray, "n n"]:
     inverse = np.linalg.pinv(best.triangle[:, :-1] / scale, rcond=RANK_TOLERANCE) / scale[:, None]
     shifts = pushes @ inverse @ inverse.T
     return shifts.T @ shifts
-
-
-def _reduce(y: Coordinates, linearisation: Linearisation, problem: Problem) -> Float[Array, "n+1 n+1"]:
-    return triangle(*jacobian(y, linearisation, problem))
 
 
 def _tangent_plane(y: Coordinates, plane: tuple[Array, Array, Array]) -> tuple[Array, None]:
@@ -295,7 +306,7 @@ def _minimise(
             started = time.perf_counter()
             trial = outermost(_shorten)(y, state.y_eval, limits)
             linearisation = start if best is None else evaluate(trial, problem)
-            factor = np.asarray(outermost(_reduce)(trial, linearisation, problem), dtype=np.float64)
+            factor = np.asarray(outermost(reduce)(trial, linearisation, problem), dtype=np.float64)
             finite = bool(np.all(np.isfinite(factor)))
             if finite:
                 chi2, held = float(np.sum(factor[:, -1] ** 2)), _hold(factor, np.asarray(trial), limits)
@@ -345,6 +356,27 @@ def _minimise(
     return best
 
 
+def _shares(best: _Point, problem: Problem) -> dict[str, Any]:
+    """What the images and what the priors contribute, and what a robust loss does."""
+    shares: dict[str, Any] = {
+        "of_images": best.triangle,
+        "of_priors": np.zeros((0, best.y.size)),
+        "inflation": None,
+        "outliers": [0] * problem.batch.used.shape[0],
+    }
+    if problem.priors is not None:
+        alone = replace(problem, priors=None)
+        factor = outermost(reduce)(best.y, best.linearisation, alone)
+        shares["of_images"] = np.asarray(factor, dtype=np.float64)
+        shares["of_priors"] = np.asarray(outermost(prior_rows)(best.y, problem.priors, problem)[1], dtype=np.float64)
+    if problem.loss is not None:
+        off = outermost(whitened)(best.y, best.linearisation, problem)
+        shares["inflation"] = float(problem.loss.inflation(off, problem.batch.used))
+        weight = np.asarray(problem.loss(off)[0])
+        shares["outliers"] = [int(n) for n in np.sum((weight < 0.5) & np.asarray(problem.batch.used), axis=1)]
+    return shares
+
+
 def _end(away: float, rejections: int, tolerance: float) -> tuple[bool, str] | None:
     """Whether the search has converged and how it ended; None while it has to go on."""
     if away < tolerance:
@@ -391,6 +423,14 @@ def _weigh(problem: Problem, expected: Array) -> Problem:
     return replace(problem, weight=weight)
 
 
+def _rescaled(y: Coordinates, linearisation: Linearisation, problem: Problem) -> Problem:
+    """``problem`` with the scale of its loss, if it has one, that of the residuals at ``y``."""
+    if problem.loss is None:
+        return problem
+    found = scale(np.asarray(outermost(whitened)(y, linearisation, problem)), np.asarray(problem.batch.used))
+    return replace(problem, loss=Loss(problem.loss.name, jnp.asarray(found, y.dtype)))
+
+
 def _expected(y: Coordinates, linearisation: Linearisation, problem: Problem) -> Predicted:
     return linearisation.radiance * problem.batch.exposure(problem.split(y)[1])
 
@@ -411,6 +451,8 @@ def solve(
     init: Atmosphere,
     free: Sequence[str],
     tie: Mapping[str, str] | None = None,
+    priors: Sequence[Prior] = (),
+    loss: str | None = None,
     model: Model,
     progress: Progress | None = None,
     max_steps: int = MAX_STEPS,
@@ -439,7 +481,9 @@ def solve(
     # Three programs, the longest first, compiled at the same time.
     _check_weights(batch, [observation.name for observation in observations])
     signal, of_planet = batch.measured, eqx.filter_eval_shape(planet_shell, model, parameters)
-    problem = Problem(model, parameters, batch, signal, of_planet, jnp.ones_like(signal))
+    problem = Problem(model, parameters, batch, signal, of_planet, jnp.ones_like(signal), collect(priors, parameters))
+    if loss is not None:
+        problem = replace(problem, loss=Loss(loss, jnp.ones((), signal.dtype)))
     compiling = [compile_ahead(linearise, parameters.start, problem)]
     finer = model.finer() if refine else None
     if finer is not None:
@@ -460,15 +504,22 @@ def solve(
     log_factors = jnp.asarray(_starting_exposures(np.asarray(start.radiance), batch), parameters.start.dtype)
     history: list[Step] = []
     search = partial(_minimise, evaluate=evaluate, max_steps=max_steps, history=history, progress=progress)
-    best = search(
-        jnp.concatenate([parameters.start, log_factors]),
-        start,
-        problem,
-        tolerance=max(tolerance, FIRST_PASS_TOLERANCE),
-    )
+    rough = max(tolerance, FIRST_PASS_TOLERANCE)
+    y, scales = jnp.concatenate([parameters.start, log_factors]), [math.inf]
+    while True:
+        problem = _rescaled(y, start, problem)
+        best = search(y, start, problem, tolerance=rough)
+        y, start = best.y, best.linearisation
+        if best.message == INTERRUPTED or problem.loss is None:
+            break
+        # While the fit gets better, fewer pixels pass for outliers.
+        scales.append(float(problem.loss.scale))
+        if scales[-1] == 1 or scales[-1] > SETTLED * scales[-2]:
+            break
     if best.message != INTERRUPTED:
-        problem = outermost(_weigh)(problem, outermost(_expected)(best.y, best.linearisation, problem))
-        best = search(best.y, best.linearisation, problem, tolerance=tolerance)
+        problem = outermost(_weigh)(problem, outermost(_expected)(y, start, problem))
+        problem = _rescaled(y, start, problem)
+        best = search(y, start, problem, tolerance=tolerance)
     model_error = np.zeros((size, size))
     if finer is not None and best.converged:
         coordinates, radiance = best.y[: parameters.size], best.linearisation.radiance
@@ -503,4 +554,5 @@ def solve(
         converged=best.converged,
         message=best.message,
         timings={"compile_s": total - evaluations, "solve_s": evaluations, "total_s": total},
+        **_shares(best, problem),
     )

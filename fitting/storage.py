@@ -10,6 +10,7 @@ of their fields with their ``type``. A model that is not one of diffatmo's own i
 import dataclasses
 import json
 import math
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Callable, Mapping
@@ -28,6 +29,7 @@ from diffatmo.phase import PhaseTable
 from fitting._errors import FitError
 from fitting.findings import Estimate, Findings
 from fitting.observation import Observation
+from fitting.priors import Prior
 from fitting.solve import Step
 
 SCHEMA, SCHEMA_VERSION = "diffatmo-result", 1
@@ -37,7 +39,7 @@ RECORD = "record"
 F = TypeVar("F", bound=Findings)
 
 _CLASSES: dict[str, Callable[..., Any]] = {
-    kind.__name__: kind for kind in (Atmosphere, Estimate, Observation, PhaseTable, Step, *PROJECTIONS.values())
+    kind.__name__: kind for kind in (Atmosphere, Estimate, Observation, PhaseTable, Prior, Step, *PROJECTIONS.values())
 }
 """What a result is made of, by the name that stands in the file."""
 
@@ -47,6 +49,8 @@ _DAMAGED = (
     LookupError,
     AttributeError,
     RuntimeError,
+    SyntaxError,
+    tokenize.TokenError,
     EOFError,
     MemoryError,
     zipfile.BadZipFile,

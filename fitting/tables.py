@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
@@ -17,13 +16,12 @@ from rich.text import Text
 from diffatmo import imageio
 from diffatmo.atmosphere import Atmosphere
 from fitting._errors import FitError
+from fitting.combinations import combinations
 from fitting.findings import Estimate, Findings
 
 FAR = 3.0
 """Standard errors from the truth beyond which an estimate is marked."""
 
-TIED = 0.99999
-"""Correlation of numbers that are multiples of each other."""
 
 PLAIN_WIDTH = 90
 """Columns of the plain text: the table with a truth and a number that is not determined just fits."""
@@ -48,12 +46,13 @@ class _Row(NamedTuple):
     fitted: str
     error: str
     relative: str
+    images: str
     start: str
     truth: str
     pull: str
 
 
-_HEADINGS = _Row("parameter", "unit", "nm", "fitted", "± error", "relative", "start", "truth", "pull")
+_HEADINGS = _Row("parameter", "unit", "nm", "fitted", "± error", "relative", "by images", "start", "truth", "pull")
 
 
 def _row(estimate: Estimate, *, first: bool) -> _Row:
@@ -72,6 +71,7 @@ def _row(estimate: Estimate, *, first: bool) -> _Row:
         fitted=format_number(value, error),
         error=shown,
         relative=f"{100 * error / abs(value):.2g} %" if error is not None and value else "",
+        images="" if estimate.data_share is None else f"{100 * estimate.data_share:.0f} %",
         start="" if estimate.initial is None else f"{estimate.initial:.3g}",
         truth="" if estimate.truth is None else f"{estimate.truth:.5g}",
         pull="" if estimate.pull is None else f"{estimate.pull:+.1f}",
@@ -92,8 +92,11 @@ def _rows(result: Findings) -> list[tuple[_Row, Estimate, bool]]:
 
 
 def _columns(result: Findings, without: Sequence[str] = ()) -> list[str]:
-    known = any(e.truth is not None for e in result.parameters)
-    return [name for name in _Row._fields if name not in without and (known or name not in ("truth", "pull"))]
+    """The columns that say something: truth where it is known, the images' share where there are priors."""
+    empty = {*without, *(() if result.priors else ("images",))}
+    if all(e.truth is None for e in result.parameters):
+        empty |= {"truth", "pull"}
+    return [name for name in _Row._fields if name not in empty]
 
 
 def table(result: Findings, truth: Atmosphere | None = None) -> Table:
@@ -131,18 +134,16 @@ def notes(result: Findings) -> list[str]:
             f"The residuals are {result.error_scale:.1f} times as large as the stated noise, and so are the standard "
             "errors. If the noise is right, the model does not describe the images as precisely as it should."
         )
-    names, signed = result.fitted_correlation
-    matrix = np.abs(np.nan_to_num(signed))
-    pairs = [
-        (matrix[i, j], names[i], names[j])
-        for i in range(len(matrix))
-        for j in range(i)
-        # Numbers that share one factor are one number.
-        if 0.95 < matrix[i, j] < TIED
-    ]
-    if pairs:
-        named = "; ".join(f"{a} and {b} ({r:.3f})" for r, a, b in sorted(pairs, reverse=True)[:6])
-        found.append(f"Determined well only in combination, as their strong correlation tells: {named}.")
+    if result.priors:
+        known = "; ".join(f"{prior} ({prior.source})" if prior.source else str(prior) for prior in result.priors)
+        found.append(f"Known beforehand: {known}. The column 'by images' says how much of each precision is their own.")
+    if sum(result.outliers):
+        found.append(f"{sum(result.outliers)} pixels count for less than half, as outliers.")
+    if said := [
+        combination.text
+        for combination in combinations(result.covariance, [result.estimate(name) for name in result.covariance_names])
+    ]:
+        found.append(f"Better known together than alone: {'; '.join(said[:6])}.")
     return found
 
 
@@ -192,6 +193,7 @@ def to_rows(result: Findings) -> list[dict[str, Any]]:
             "unit": estimate.unit,
             "value": estimate.value,
             "standard_error": estimate.standard_error,
+            "data_share": estimate.data_share,
             "initial": estimate.initial,
             "truth": estimate.truth,
             "pull": estimate.pull,

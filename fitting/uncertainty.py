@@ -31,6 +31,7 @@ from diffatmo.models import Model, Moments
 from fitting.findings import Estimate
 from fitting.observation import Observation, unstack
 from fitting.parameters import Coordinates, Parameters
+from fitting.priors import Prior
 from fitting.quantities import numbers, quantities
 from fitting.result import FitResult
 from fitting.solve import MAX_STEPS, RANK_TOLERANCE, TOLERANCE, Progress, Solution, solve
@@ -59,6 +60,23 @@ def propagate(
     return covariance, determined
 
 
+def data_shares(
+    of_images: Float[np.ndarray, "n n"], factor: Float[np.ndarray, "n n"], gradient: Float[np.ndarray, "q n"]
+) -> list[float]:
+    """The part of each number's precision that comes from the images, from 0 (all is prior) to 1.
+
+    With the covariance C = (F_images + F_priors)⁻¹, the variance of a number with gradient g is gᵀCg = gᵀC (F_images +
+    F_priors) Cg, and the first term is the images' part: the averaging kernel of retrievals (Rodgers 2000, eq. 2.78).
+    """
+    length = np.linalg.norm(factor, axis=0)
+    unit = np.where(length > 0, length, 1)
+    inverse = np.linalg.pinv(factor / unit, rcond=RANK_TOLERANCE) / unit[:, None]
+    half = gradient @ inverse
+    along = np.linalg.norm(half @ inverse.T @ of_images.T, axis=1)
+    whole = np.linalg.norm(half, axis=1)
+    return [float(np.clip((a / w) ** 2, 0, 1)) if w > 0 else 0.0 for a, w in zip(along, whole, strict=True)]
+
+
 def _physical(
     y: Coordinates, parameters: Parameters
 ) -> tuple[Float[Array, " q"], tuple[Float[Array, " q"], Atmosphere]]:
@@ -73,7 +91,14 @@ def _slopes(y: Coordinates, parameters: Parameters) -> Any:
     return jax.jacfwd(_physical, has_aux=True)(y, parameters)
 
 
-def summarise(solution: Solution, observations: Sequence[Observation], model: Model, *, refine: bool) -> FitResult:
+def summarise(
+    solution: Solution,
+    observations: Sequence[Observation],
+    model: Model,
+    *,
+    priors: Sequence[Prior] = (),
+    refine: bool,
+) -> FitResult:
     """Attach error bars to ``solution``, which was found with ``model``, and its finer self if ``refine``."""
     parameters = solution.parameters
     count = parameters.size
@@ -84,10 +109,14 @@ def summarise(solution: Solution, observations: Sequence[Observation], model: Mo
 
     slopes, (numbers_found, atmosphere) = outermost(_slopes)(solution.y, parameters)
     values, gradient = np.asarray(numbers_found, dtype=float), np.asarray(slopes, dtype=float)
-    covariance, determined = propagate(solution.triangle[:-1, :-1], gradient)
     reduced_chi2 = solution.chi2 / max(solution.degrees_of_freedom, 1)
-    scale = max(1.0, math.sqrt(reduced_chi2))
-    covariance = scale**2 * covariance + gradient @ solution.model_error @ gradient.T
+    scale = max(1.0, math.sqrt(reduced_chi2 if solution.inflation is None else solution.inflation))
+    # What is known beforehand stays as it is, however large the residuals of the images are.
+    of_images = solution.of_images[:-1, :-1] / scale
+    factor = np.asarray(np.linalg.qr(np.vstack([of_images, solution.of_priors]), mode="r"))
+    covariance, determined = propagate(factor, gradient)
+    shares = data_shares(of_images, factor, gradient)
+    covariance = covariance + gradient @ solution.model_error @ gradient.T
     errors = [math.sqrt(v) if ok else None for v, ok in zip(np.diag(covariance), determined, strict=True)]
     initial = np.asarray(numbers(parameters.atmosphere(parameters.start), free + derived), dtype=float)
     at_bound = parameters.at_bound(np.asarray(solution.y)[:count])
@@ -103,6 +132,7 @@ def summarise(solution: Solution, observations: Sequence[Observation], model: Mo
             initial=float(initial[i]),
             derived=i >= len(fitted_quantities),
             at_bound=i < len(fitted_quantities) and bool(at_bound[i]),
+            data_share=shares[i] if determined[i] else None,
         )
         for i, quantity in enumerate(all_quantities)
     ]
@@ -126,6 +156,8 @@ def summarise(solution: Solution, observations: Sequence[Observation], model: Mo
         timings=solution.timings,
         observations=list(observations),
         fitted=[unstack(o, image) for o, image in zip(observations, solution.predicted, strict=True)],
+        priors=list(priors),
+        outliers=solution.outliers,
         undetermined=[e.name for e in [*estimates, *factors] if e.standard_error is None],
         model=model,
         refine=refine,
@@ -138,6 +170,8 @@ def fit(
     init: Atmosphere,
     free: Sequence[str],
     tie: Mapping[str, str] | None = None,
+    priors: Sequence[Prior] = (),
+    loss: str | None = None,
     model: Model | None = None,
     progress: Progress | None = None,
     max_steps: int = MAX_STEPS,
@@ -154,6 +188,9 @@ def fit(
         tie: How the wavelengths of a spectral field hang together, name -> kind: ``start`` (a common factor times the
             values of ``init``), ``grey``, ``lambda^-4`` (of ``rayleigh_scattering``), ``dobson`` (of ``ozone_absorption``), or
             ``{"mie": "angstrom"}``; see :mod:`fitting.parameters`.
+        priors: What is known beforehand (:mod:`fitting.priors`).
+        loss: None for least squares; ``huber``, ``cauchy`` or ``tukey`` where clouds or objects are in the picture
+            (:mod:`fitting.robust`).
         model: How the sky is computed, :class:`~diffatmo.models.moments.Moments` by default.
         progress: Called after each step.
         max_steps: Evaluations of the model with its derivatives before the fit gives up.
@@ -174,10 +211,12 @@ def fit(
         init=init,
         free=free,
         tie=tie,
+        priors=priors,
+        loss=loss,
         model=model,
         progress=progress,
         max_steps=max_steps,
         tolerance=tolerance,
         refine=refine,
     )
-    return summarise(solution, observations, model, refine=refine)
+    return summarise(solution, observations, model, priors=priors, refine=refine)

@@ -49,6 +49,22 @@ def s1() -> Atmosphere:
     )
 
 
+@pytest.fixture(scope="session")
+def _compilations() -> list[str]:
+    events: list[str] = []
+    jax.monitoring.register_event_duration_secs_listener(
+        lambda event, *_, **__: events.append(event) if event.endswith("backend_compile_duration") else None
+    )
+    return events
+
+
+@pytest.fixture
+def compilations(_compilations) -> list[str]:
+    """Grows by one whenever JAX compiles a program."""
+    _compilations.clear()
+    return _compilations
+
+
 @pytest.fixture
 def check_jacobian():
     """Compare forward and reverse derivatives with central differences; use it together with ``x64``.

@@ -40,18 +40,21 @@ LEVELS = [
     ["fitting._errors"],
     ["fitting.bijections", "fitting.quantities"],
     ["fitting.parameters", "fitting.observation"],
+    ["fitting.priors", "fitting.robust"],
     ["fitting.residuals"],
     ["fitting.solve"],
     ["fitting.findings"],
+    ["fitting.combinations"],
     ["fitting.tables", "fitting.figures", "fitting.prediction", "fitting.storage"],
     ["fitting.report", "fitting.result"],
     ["fitting.uncertainty"],
     ["fitting"],
     ["diffatmo"],  # the lazy public interface
-    ["diffatmo.cli", "diffatmo.cli.cache", "diffatmo.cli.common"],
-    ["diffatmo.cli.keys", "diffatmo.cli.shipped"],
+    ["diffatmo.cli", "diffatmo.cli.cache", "diffatmo.cli.common", "diffatmo.cli.workers"],
+    ["diffatmo.cli.keys", "diffatmo.cli.shipped", "diffatmo.cli.results"],
     ["diffatmo.cli.scenefile"],
-    ["diffatmo.cli.images"],
+    ["diffatmo.cli.images", "diffatmo.cli.origin"],
+    ["diffatmo.cli.many"],
     ["diffatmo.cli.radiance", "diffatmo.cli.render", "diffatmo.cli.fit"],
     ["diffatmo.cli.compare", "diffatmo.cli.export"],
     ["diffatmo.cli.main"],
@@ -126,9 +129,11 @@ def test_public_names_resolve():
 def test_model_names_of_the_command_line():
     from diffatmo import models
     from diffatmo.models import tables
+    from fitting import robust
 
     assert tuple(models.MODELS) == common.MODELS
     assert set(scenefile.MODELS) == set(models.MODELS) - {"pathtrace"}
+    assert robust.LOSSES == scenefile.LOSSES
     assert export.PARAMETERISATIONS == tables.PARAMETERISATIONS
 
 

@@ -90,6 +90,8 @@ def test_auto_exposure_ignores_the_sun_and_survives_black():
     assert float(color.auto_exposure(picture)) == pytest.approx(1, rel=1e-5)
     assert float(color.auto_exposure(4 * picture)) == pytest.approx(0.25, rel=1e-5)
     assert float(color.auto_exposure(jnp.zeros((4, 4, 3)))) == 1
+    framed = jnp.full((20, 20, 3), jnp.nan).at[5:15, 5:15].set(picture.reshape(10, 10, 3))
+    assert float(color.auto_exposure(framed)) == float(color.auto_exposure(picture))
     assert np.isfinite(jax.grad(lambda p: color.auto_exposure(p))(jnp.zeros((4, 4, 3)))).all()
 
 

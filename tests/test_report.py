@@ -9,7 +9,7 @@ import pytest
 import toy_sky
 from rich.console import Console
 
-from diffatmo import atmosphere, imageio, scene
+from diffatmo import atmosphere, color, imageio, scene
 from fitting import FitError, report
 from fitting.tables import format_number
 
@@ -78,6 +78,19 @@ def test_pictures(written):
     assert residual.wavelengths == (680, 550, 440)
     for kind in ("fitted", "residual"):
         assert imageio.read_image(written[0] / f"{kind}_sun_60.png", transfer="srgb").pixels.shape == (16, 64, 3)
+
+
+def test_images_of_one_size_are_developed_by_one_program(compilations):
+    """Whatever pixels are used: of many images, only the first waits for the compiler."""
+    seen, bands = toy_sky.result().observations[0], [680.0, 550.0, 440.0]
+    other = dataclasses.replace(seen, used=seen.used & (np.arange(64) > 20))
+    report.developed(seen, seen.image, bands)
+    before = len(compilations)
+    picture, _ = report.developed(other, seen.image, bands)
+    assert len(compilations) == before
+    # The exposure is that of the used pixels alone.
+    level = np.percentile(seen.image[other.used] @ color.LUMINANCE, 90)
+    assert np.allclose(picture[4, 30], color.srgb_encode(1 - np.exp(-seen.image[4, 30] / level)), rtol=1e-4)
 
 
 def test_page_needs_nothing_else(written):

@@ -1,5 +1,6 @@
 """What the subcommands share: their error, the choice of a model, and the checks of what they read and write."""
 
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -8,6 +9,8 @@ import click
 from diffatmo import folders
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from diffatmo.atmosphere import Atmosphere
     from diffatmo.models import Model
 
@@ -15,8 +18,46 @@ MODELS = ("moments", "bruneton", "hillaire", "raymarch", "pathtrace")
 """Names of ``diffatmo.models.MODELS``, repeated here because importing that takes seconds; a test compares the two."""
 
 
+PLAIN_WIDTH = 120
+"""Columns of the output where it does not go to a terminal."""
+
+INTERRUPTED = 130
+"""Exit status after Ctrl-C, by the convention of shells."""
+
+
 class InputError(ValueError):
     """Something the user gave is wrong; the message says what, and what would be right."""
+
+
+def is_refusal(error: BaseException) -> bool:
+    """Whether ``error`` refuses what the user gave or reports what the system denied; any other is a fault of ours."""
+    if isinstance(error, click.ClickException | OSError):
+        return True
+    return isinstance(error, ValueError) and type(error).__module__.partition(".")[0] in ("diffatmo", "fitting")
+
+
+def one_line(error: BaseException) -> str:
+    """What is wrong, in one line."""
+    if isinstance(error, click.ClickException):
+        message = error.format_message()
+    elif isinstance(error, OSError) and error.filename is not None:
+        message = f"{error.filename}: {error.strerror}"
+    else:
+        message = str(error)
+    return " ".join(message.split())
+
+
+def printable(name: str | Path) -> str:
+    """A file name as text that can be written anywhere: bytes that are no text are shown by their numbers."""
+    return str(name).encode("utf-8", errors="backslashreplace").decode()
+
+
+def make_console(*, quiet: bool = False) -> "Console":
+    """The terminal; where the output goes elsewhere, as wide as a table needs."""
+    from rich.console import Console
+
+    width = None if sys.stdout.isatty() else PLAIN_WIDTH
+    return Console(width=width, highlight=False, markup=False, quiet=quiet)
 
 
 def model_options(command: Any) -> Any:

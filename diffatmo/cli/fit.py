@@ -1,6 +1,5 @@
 """``diffatmo fit``: recover the parameters of an atmosphere from images of its sky."""
 
-import sys
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -9,23 +8,22 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from diffatmo.cli import keys, shipped
-from diffatmo.cli.common import InputError, make_model, overwrite_option, read_atmosphere
+from diffatmo.cli import keys, many, shipped
+from diffatmo.cli.common import InputError, make_console, make_model, overwrite_option, printable, read_atmosphere
 from diffatmo.cli.images import observe
-from diffatmo.cli.scenefile import FREE, IMAGE_KEYS, MODELS, FitSpec, ImageSpec, check_image_options, read_scene
+from diffatmo.cli.scenefile import FREE, IMAGE_KEYS, LOSSES, MODELS, FitSpec, ImageSpec, check_image_options, read_scene
 
 if TYPE_CHECKING:
     from diffatmo.atmosphere import Atmosphere
-    from fitting import Observation, Step
+    from fitting import Observation, Prior, Step
+    from fitting.parameters import Parameters
 
 NOT_CONVERGED = 1
 MAX_STEPS = 100
-PLAIN_WIDTH = 120
-"""Columns of the output where it does not go to a terminal."""
 
 
 @click.command()
-@click.argument("images", metavar="[IMAGE]...", nargs=-1, type=click.Path(path_type=Path))
+@click.argument("images", metavar="[IMAGE|FOLDER]...", nargs=-1, type=click.Path(path_type=Path))
 @click.option("--config", metavar="SCENE.toml", type=click.Path(path_type=Path), help="Scene file, instead of images.")
 @click.option(
     "--init", metavar="ATM.toml", help="Where the fit starts: an atmosphere file or a preset.  [default: earth]"
@@ -36,9 +34,20 @@ PLAIN_WIDTH = 120
     metavar="NAME=TIE,...",
     help="How wavelengths hang together: start (keep the ratios of the start), grey, lambda^-4, dobson, mie=angstrom.",
 )
+@click.option(
+    "--loss", type=click.Choice(LOSSES), help="For clouds and objects in the picture, instead of least squares."
+)
 @click.option("--model", type=click.Choice(MODELS), help="How the sky is computed.  [default: moments]")
 @click.option("--max-steps", type=click.IntRange(min=1), help="Steps before the fit gives up.  [default: 100]")
 @keys.options(IMAGE_KEYS)
+@click.option("--each", is_flag=True, help="Fit each image on its own, as those of a FOLDER are.")
+@click.option(
+    "--jobs",
+    "processes",
+    type=click.IntRange(min=1),
+    help="Images of a FOLDER fitted at a time; each takes 1 to 2 GB of memory.  [default: one for every two cores, up to 8]",
+)
+@click.option("--resume", is_flag=True, help="Of a FOLDER, fit only what has no complete result yet.")
 @click.option(
     "-o",
     "--output",
@@ -55,8 +64,12 @@ def fit(
     init: str | None,
     free: str | None,
     tie: str | None,
+    loss: str | None,
     model: str | None,
     max_steps: int | None,
+    each: bool,
+    processes: int | None,
+    resume: bool,
     output: Path,
     overwrite: bool,
     **values: Any,
@@ -67,9 +80,29 @@ def fit(
     scene file says them for each image. Without images or a scene file, the images that come with diffatmo are fitted.
 
     Writes fit.json, atmosphere.toml, pictures of images, fits and residuals, and report.html.
+
+    A FOLDER stands for the images in it, each fitted on its own, several at a time: DIR gets a folder for each image, and
+    results.csv with a row for each. One that cannot be fitted does not stop the others.
     """
-    override = {"init": init, "free": _names(free), "tie": _ties(tie), "model": model, "max_steps": max_steps}
-    specs = plan(images, config, keys.given(IMAGE_KEYS, values), output)
+    override = {
+        "init": init,
+        "free": _names(free),
+        "tie": _ties(tie),
+        "loss": loss,
+        "model": model,
+        "max_steps": max_steps,
+    }
+    options = keys.given(IMAGE_KEYS, values)
+    if each or any(image.is_dir() for image in images):
+        if not images and not config:
+            raise InputError("--each: no IMAGE, FOLDER or --config says what to fit")
+        mask = Path(options["mask"]) if "mask" in options else None
+        (spec,) = plan(many.expand(images, mask=mask), config, options, output).values()
+        spec, fitter = spec.override(**override), many.Fitter(prepare, run_quietly)
+        return many.fit_each(spec, output, fitter, jobs=processes, resume=resume, overwrite=overwrite)
+    if resume or processes:
+        raise InputError(f"{'--resume' if resume else '--jobs'} is for the images of a FOLDER, or with --each")
+    specs = plan(images, config, options, output)
     # All that can be wrong is found before the first fit, which is written as soon as it is done.
     jobs = {directory: prepare(spec.override(**override)) for directory, spec in specs.items()}
     from fitting import report
@@ -104,6 +137,8 @@ class Job:
     truth: "Atmosphere | None"
     free: tuple[str, ...]
     tie: Mapping[str, str]
+    priors: "list[Prior]"
+    loss: str | None
     model: str
     refine: bool
     max_steps: int
@@ -112,11 +147,14 @@ class Job:
 def prepare(spec: FitSpec) -> Job:
     """Read all that ``spec`` names."""
     from diffatmo.atmosphere import dumps
+    from fitting import priors
     from fitting.parameters import select
 
     init = read_atmosphere(spec.init or "earth")
     free, tie = spec.free if spec.free is not None else FREE, spec.tie or {}
-    select(init, free, tie)
+    parameters = select(init, free, tie)
+    known = [prior for table in spec.priors or () for prior in make_priors(table, parameters)]
+    priors.collect(known, parameters)
     seen = [observe(image, name, init) for image, name in zip(spec.images, image_names(spec.images), strict=True)]
     # Images of different atmospheres have no truth in common.
     truths = {dumps(truth): truth for truth in (image.truth for image in seen) if truth is not None}
@@ -127,6 +165,8 @@ def prepare(spec: FitSpec) -> Job:
         truth=next(iter(truths.values())) if len(truths) == 1 else None,
         free=tuple(free),
         tie=tie,
+        priors=known,
+        loss=spec.loss,
         model=model,
         # A finer model would correct what is not wrong in images that the model itself has made.
         refine=any(image.model != model for image in seen),
@@ -134,9 +174,25 @@ def prepare(spec: FitSpec) -> Job:
     )
 
 
+def make_priors(table: Mapping[str, Any], parameters: "Parameters") -> "list[Prior]":
+    """The priors of one table of a scene file."""
+    from fitting import priors
+
+    said = {key: value for key, value in table.items() if key != "kind"}
+    if table["kind"] == "molecular":
+        return priors.molecular(parameters.init, **said)
+    if table["kind"] == "ozone":
+        return priors.ozone(**(said | {"day_of_year": int(said["day_of_year"])}))
+    if table["kind"] == "aerosol":
+        return priors.aerosol(said["type"], parameters)
+    relative = "relative_error" in said
+    error = said["relative_error" if relative else "error"]
+    return [priors.Prior(said["name"], said["value"], error, relative, "the scene file")]
+
+
 def image_names(images: Sequence[ImageSpec]) -> list[str]:
     """A name for each image: that of its file, and a number where several files have the same."""
-    stems = [image.file.stem for image in images]
+    stems = [printable(image.file.stem) for image in images]
     total, seen = Counter(stems), Counter[str]()
     names = []
     for stem in stems:
@@ -145,17 +201,18 @@ def image_names(images: Sequence[ImageSpec]) -> list[str]:
     return names
 
 
-def run(job: Job, directory: Path, *, overwrite: bool) -> bool:
-    """Fit, write the report, show the table; whether the fit converged."""
-    from rich.console import Console
+def run(job: Job, directory: Path, *, overwrite: bool, quiet: bool = False) -> bool:
+    """Fit, write the report, show the table unless ``quiet``; whether the fit converged."""
+    from rich.text import Text
 
     import fitting
     from diffatmo.models import Bruneton
     from fitting import report
 
-    console = Console(width=None if sys.stdout.isatty() else PLAIN_WIDTH, highlight=False)
+    console = make_console(quiet=quiet)
     count = len(job.observations)
-    console.print(f"\n[bold]{directory.name}[/]: {count} image{'s' * (count > 1)}, free: {', '.join(job.free)}")
+    name = Text(f"\n{printable(directory.name)}", style="bold")
+    console.print(name + f": {count} image{'s' * (count > 1)}, free: {', '.join(job.free)}")
 
     for observation in job.observations:
         if observation.block > 1:
@@ -172,6 +229,8 @@ def run(job: Job, directory: Path, *, overwrite: bool) -> bool:
             init=job.init,
             free=job.free,
             tie=job.tie,
+            priors=job.priors,
+            loss=job.loss,
             model=Bruneton.reduced() if job.model == "bruneton" else make_model(job.model),
             progress=show,
             max_steps=job.max_steps,
@@ -181,6 +240,14 @@ def run(job: Job, directory: Path, *, overwrite: bool) -> bool:
     console.print(report.table(result, job.truth))
     console.print(f"Report: {directory / 'report.html'}", soft_wrap=True)
     return result.converged
+
+
+def run_quietly(job: Job, directory: Path, overwrite: bool) -> None:
+    """One fit of many: found to be possible to write before it begins, and without a word."""
+    from fitting import report
+
+    report.check_writable(directory, overwrite=overwrite)
+    run(job, directory, overwrite=overwrite, quiet=True)
 
 
 def _names(text: str | None) -> tuple[str, ...] | None:

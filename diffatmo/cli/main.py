@@ -1,7 +1,7 @@
 """The ``diffatmo`` command: its subcommands, and how it ends.
 
-Exit status: 0 for success, 1 for a fit that did not converge (its best point is written all the same), 2 for bad input,
-reported in one line on the standard error.
+Exit status: 0 for success, 1 for a fit that did not converge (its best point is written all the same) or for images of many
+that could not be fitted, 2 for bad input, reported in one line on the standard error, 130 after Ctrl-C.
 """
 
 import sys
@@ -11,6 +11,7 @@ import click
 
 from diffatmo import __version__
 from diffatmo.cli import cache
+from diffatmo.cli.common import INTERRUPTED, is_refusal, one_line
 from diffatmo.cli.compare import compare
 from diffatmo.cli.export import export
 from diffatmo.cli.fit import fit
@@ -18,7 +19,6 @@ from diffatmo.cli.radiance import radiance
 from diffatmo.cli.render import render
 
 BAD_INPUT = 2
-INTERRUPTED = 130
 
 
 @click.group(
@@ -50,25 +50,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         status = diffatmo.main(args=arguments, prog_name="diffatmo", standalone_mode=False)
     except click.Abort:
         return INTERRUPTED
-    except (click.ClickException, OSError) as error:
-        return _refuse(error)
-    except ValueError as error:
-        # The errors of our own refuse what the user gave; any other is a fault of ours and keeps its traceback.
-        if type(error).__module__.partition(".")[0] not in ("diffatmo", "fitting"):
+    except (click.ClickException, OSError, ValueError) as error:
+        if not is_refusal(error):
             raise
-        return _refuse(error)
+        print("diffatmo: error:", one_line(error), file=sys.stderr)
+        return BAD_INPUT
     return status or 0
-
-
-def _refuse(error: Exception) -> int:
-    if isinstance(error, click.ClickException):
-        message = error.format_message()
-    elif isinstance(error, OSError) and error.filename is not None:
-        message = f"{error.filename}: {error.strerror}"
-    else:
-        message = str(error)
-    print("diffatmo: error:", " ".join(message.split()), file=sys.stderr)
-    return BAD_INPUT
 
 
 if __name__ == "__main__":

@@ -48,7 +48,30 @@ IMAGE_KEYS: dict[str, Key] = {
 MODELS = ("moments", "bruneton", "hillaire", "raymarch")
 """The models that have derivatives."""
 
-SCENE_KEYS = ("init", "free", "tie", "model", "max_steps", "image")
+LOSSES = ("huber", "cauchy", "tukey")
+"""Those of ``fitting.robust``, which takes seconds to import; a test compares the two."""
+
+PRIOR_KEYS: dict[str, dict[str, Key]] = {
+    "number": {
+        "name": Word("A parameter or derived quantity, with _<nm> for one wavelength of it."),
+        "value": Number("What it is thought to be."),
+        "error": Number("Standard deviation.", 0, positive=True),
+        "relative_error": Number("Standard deviation of the logarithm, instead.", 0, positive=True),
+    },
+    "molecular": {
+        "pressure_hpa": Number("At the ground.  [default: 1013.25]", 0, positive=True),
+        "temperature_k": Number("At the ground.  [default: 288.15]", 0, positive=True),
+    },
+    "ozone": {
+        "latitude_deg": Number("Of the place.", -90, 90),
+        "longitude_deg": Number("Of the place, east positive.", -180, 180),
+        "day_of_year": Number("From 1.", 1, 366),
+    },
+    "aerosol": {"type": Word("As in OPAC, like continental average.")},
+}
+"""The keys of a ``[[prior]]`` by its kind; ``number`` is that of a table without ``kind``."""
+
+SCENE_KEYS = ("init", "free", "tie", "prior", "loss", "model", "max_steps", "image")
 
 
 @dataclass(frozen=True)
@@ -67,6 +90,9 @@ class FitSpec:
     init: str | None = None
     free: tuple[str, ...] | None = None
     tie: Mapping[str, str] | None = None
+    priors: tuple[Mapping[str, Any], ...] | None = None
+    """Tables of the keys of :data:`PRIOR_KEYS`, each complete."""
+    loss: str | None = None
     model: str | None = None
     max_steps: int | None = None
 
@@ -119,7 +145,11 @@ def _scene(data: Mapping[str, Any], directory: Path) -> FitSpec:
     max_steps = data.get("max_steps")
     if max_steps is not None and (isinstance(max_steps, bool) or not isinstance(max_steps, int) or max_steps < 1):
         raise InputError(f"max_steps: got {max_steps!r}, expected a whole number of at least 1")
-    return FitSpec(tuple(images), init, _names(data, "free"), _tie(data.get("tie")), model, max_steps)
+    loss = data.get("loss")
+    if loss is not None:
+        loss = read(Word("What outliers are given.", LOSSES), "loss", loss)
+    free, tie, priors = _names(data, "free"), _tie(data.get("tie")), _priors(data.get("prior"))
+    return FitSpec(tuple(images), init, free, tie, priors, loss, model, max_steps)
 
 
 def _image(table: Mapping[str, Any], directory: Path) -> ImageSpec:
@@ -147,6 +177,34 @@ def _tie(tie: Any) -> dict[str, str] | None:
     if tie is not None and not (isinstance(tie, dict) and all(isinstance(kind, str) for kind in tie.values())):
         raise InputError(f'tie: got {tie!r}, expected a table like {{ mie = "angstrom", ground_albedo = "grey" }}')
     return tie
+
+
+def _priors(tables: Any) -> tuple[Mapping[str, Any], ...] | None:
+    if tables is None:
+        return None
+    if not isinstance(tables, list) or not all(isinstance(table, dict) for table in tables):
+        raise InputError("prior: expected [[prior]] tables")
+    try:
+        return tuple(_prior(table) for table in tables)
+    except InputError as error:
+        raise InputError(f"prior: {error}") from error
+
+
+def _prior(table: Mapping[str, Any]) -> Mapping[str, Any]:
+    """One ``[[prior]]``, with its kind."""
+    kinds = tuple(PRIOR_KEYS)[1:]
+    kind = read(Word("", kinds), "kind", table["kind"]) if "kind" in table else "number"
+    keys = PRIOR_KEYS[kind]
+    given = {key: value for key, value in table.items() if key != "kind"}
+    _refuse_unknown(given, tuple(keys))
+    values = {key: read(keys[key], key, value) for key, value in given.items()}
+    if kind == "number" and ("error" in values) == ("relative_error" in values):
+        raise InputError("expected one of error and relative_error")
+    needed = {"number": ("name", "value"), "molecular": ()}.get(kind, tuple(keys))
+    for key in needed:
+        if key not in values:
+            raise InputError(f"{key}: missing, expected {keys[key].expected}")
+    return {"kind": kind, **values}
 
 
 def _refuse_unknown(table: Mapping[str, Any], known: tuple[str, ...]) -> None:

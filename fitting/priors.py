@@ -1,0 +1,171 @@
+"""What is known of an atmosphere before an image is looked at.
+
+A prior is a normal distribution of one number of the result (:mod:`fitting.quantities`), or of its logarithm. It enters the
+fit as one more residual, (number - value) / error, and the result says for every number how much of its precision is the
+images' own. The named priors state what the field knows anyway, each with its source.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from diffatmo import constants, spectrum
+from diffatmo.atmosphere import Atmosphere
+from diffatmo.numerics import safe_log
+from fitting._errors import FitError
+from fitting.parameters import Parameters
+from fitting.quantities import DERIVED, numbers, quantities
+
+
+@dataclass(frozen=True)
+class Prior:
+    """``name`` is ``value`` ± ``error``.
+
+    ``name`` is a number of the result (``rayleigh_optical_depth_550``), or a spectral field, which means each of its
+    wavelengths on its own. With ``relative``, ``error`` is one of the logarithm: 0.1 for 10 %, ln 2 for a factor of two.
+    """
+
+    name: str
+    value: float
+    error: float
+    relative: bool = False
+    source: str = ""
+
+    def __str__(self) -> str:
+        """As one would write it."""
+        spread = f"× e^±{self.error:.2g}" if self.relative else f"± {self.error:.3g}"
+        return f"{self.name} = {self.value:.5g} {spread}"
+
+
+class Priors(eqx.Module):
+    """Priors as residuals."""
+
+    fields: tuple[str, ...] = eqx.field(static=True)
+    index: Int[Array, " k"]
+    """Which of the numbers of ``fields``."""
+    value: Float[Array, " k"]
+    error: Float[Array, " k"]
+    relative: Bool[Array, " k"]
+
+    def residuals(self, atmosphere: Atmosphere) -> Float[Array, " k"]:
+        """(number - value) / error."""
+        found = numbers(atmosphere, self.fields)[self.index]
+        # safe_log is finite at zero, where a number may start.
+        logarithm = safe_log(found) - safe_log(jnp.where(self.relative, self.value, 1))
+        return jnp.where(self.relative, logarithm, found - self.value) / self.error
+
+
+def collect(priors: Sequence[Prior], parameters: Parameters) -> Priors | None:
+    """``priors`` on numbers of ``parameters``; raises :class:`FitError` for one that is not of a number that varies."""
+    if not priors:
+        return None
+    wavelengths = [float(nm) for nm in parameters.init.wavelengths]
+    free = set(parameters.fields)
+    fields = [*parameters.fields, *(name for name in DERIVED if free & set(DERIVED[name].ingredients))]
+    known = quantities(fields, wavelengths)
+    index: list[int] = []
+    stated: list[Prior] = []
+    for prior in priors:
+        if not (prior.error > 0 and math.isfinite(prior.error) and math.isfinite(prior.value)):
+            raise FitError(f"prior: {prior}: expected a finite value and a finite error > 0")
+        if prior.relative and not prior.value > 0:
+            raise FitError(f"prior: {prior}: a relative error needs a value > 0")
+        meant = [number for number, known_one in enumerate(known) if prior.name == known_one.name]
+        meant = meant[:1] or [number for number, known_one in enumerate(known) if prior.name == known_one.field]
+        if not meant:
+            names = ", ".join(dict.fromkeys(one.field for one in known))
+            raise FitError(f"prior: {prior.name!r} does not vary in this fit; numbers that do are of {names}")
+        index += meant
+        stated += [prior] * len(meant)
+    dtype = parameters.start.dtype
+    return Priors(
+        fields=tuple(fields),
+        index=jnp.asarray(index),
+        value=jnp.asarray([prior.value for prior in stated], dtype),
+        error=jnp.asarray([prior.error for prior in stated], dtype),
+        relative=jnp.asarray([prior.relative for prior in stated]),
+    )
+
+
+# Named priors -------------------------------------------------------------------------------------------------------
+
+
+def molecular(init: Atmosphere, *, pressure_hpa: float = 1013.25, temperature_k: float = 288.15) -> list[Prior]:
+    """Air, from pressure and temperature at the ground.
+
+    The optical depth of air is proportional to the mass above, thus to the pressure: Bodhaine et al. 1999, J. Atmos. Oceanic
+    Technol. 16, 1854, whose values are good to 0.5 %. Column over density at the ground is R T / (M g) for any profile in
+    hydrostatic equilibrium; that an exponential stands for the real profile makes it uncertain by 5 %.
+    """
+    for name, value in (("pressure_hpa", pressure_hpa), ("temperature_k", temperature_k)):
+        if not (value > 0 and math.isfinite(value)):
+            raise FitError(f"prior: molecular: {name}: got {value}, expected a number > 0")
+    height = constants.GAS_CONSTANT * temperature_k / (constants.MOLAR_MASS_AIR * constants.GRAVITY) / 1000
+    # The coefficients of the spectrum are those of sea level in the standard atmosphere.
+    standard = spectrum.rayleigh_scattering(init.wavelengths)
+    standard_height = constants.GAS_CONSTANT * 288.15 / (constants.MOLAR_MASS_AIR * constants.GRAVITY) / 1000
+    depths = standard * standard_height * pressure_hpa / 1013.25
+    source = "Bodhaine et al. 1999; hydrostatic equilibrium"
+    return [
+        *(
+            Prior(f"rayleigh_optical_depth_{float(nm):g}", float(depth), 0.005, True, source)
+            for nm, depth in zip(init.wavelengths, depths, strict=True)
+        ),
+        Prior("rayleigh_scale_height", height, 0.05, True, source),
+    ]
+
+
+def ozone(*, latitude_deg: float, longitude_deg: float, day_of_year: int) -> list[Prior]:
+    """The column of ozone, from its climatology: Van Heuklon 1979, Solar Energy 22, 63, good to some 10 %.
+
+    Where ozone is not tied to its own spectrum (``"dobson"``), this is a prior on the sum over the wavelengths.
+    """
+    if not (-90 <= latitude_deg <= 90 and -180 <= longitude_deg <= 180 and 1 <= day_of_year <= 366):
+        raise FitError(
+            f"prior: ozone: got latitude {latitude_deg}, longitude {longitude_deg}, day {day_of_year}; expected degrees from "
+            "-90 to 90 and -180 to 180, and a day from 1 to 366"
+        )
+    north = latitude_deg >= 0
+    a, b, c, f, g, h = (150, 1.28, 40, -30, 20, 3) if north else (100, 1.5, 30, 152.625, 20, 2)
+    i = (20 if longitude_deg > 0 else 0) if north else -75
+    season = c * math.sin(math.radians(0.9865 * (day_of_year + f)))
+    around = g * math.sin(math.radians(h * (longitude_deg + i)))
+    column = 235 + (a + season + around) * math.sin(math.radians(b * latitude_deg)) ** 2
+    return [Prior("ozone_column", column, 0.1, True, "Van Heuklon 1979")]
+
+
+AEROSOLS = {
+    "continental clean": (0.972, 0.709, 1.42),
+    "continental average": (0.925, 0.703, 1.42),
+    "continental polluted": (0.892, 0.698, 1.45),
+    "urban": (0.817, 0.689, 1.43),
+    "desert": (0.888, 0.729, 0.17),
+    "maritime clean": (0.997, 0.772, 0.08),
+    "maritime polluted": (0.975, 0.756, 0.35),
+    "maritime tropical": (0.998, 0.774, 0.04),
+    "arctic": (0.887, 0.721, 0.89),
+    "antarctic": (1.000, 0.784, 0.73),
+}
+"""Single scattering albedo and asymmetry at 550 nm, Ångström exponent from 500 to 800 nm; humidity 80 % (Hess et al. 1998)."""
+
+
+def aerosol(kind: str, parameters: Parameters) -> list[Prior]:
+    """An aerosol of a type of OPAC (Hess, Koepke & Schult 1998, Bull. Amer. Meteor. Soc. 79, 831, table 4).
+
+    As far as these vary in the fit: single scattering albedo ± 0.04 at each wavelength, asymmetry ± 0.04, Ångström exponent
+    ± 0.3, by which the types differ among themselves and with humidity.
+    """
+    if kind not in AEROSOLS:
+        raise FitError(f"prior: aerosol: got {kind!r}, expected one of {', '.join(AEROSOLS)}")
+    albedo, asymmetry, exponent = AEROSOLS[kind]
+    source = f"Hess et al. 1998, {kind}"
+    wanted = [
+        Prior("mie_single_scattering_albedo", albedo, 0.04, source=source),
+        Prior("mie_g", asymmetry, 0.04, source=source),
+        Prior("mie_angstrom_exponent", exponent, 0.3, source=source),
+    ]
+    return [prior for prior in wanted if prior.name in (*parameters.fields, *parameters.derived)]

@@ -1,0 +1,142 @@
+"""Priors: residuals of their own, the share of the images, and the numbers of the named ones."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import toy_sky
+from toy_sky import Toy
+
+from diffatmo import earth
+from fitting import FitError, Prior, fit, priors
+from fitting.parameters import select
+
+FEW = ["rayleigh_scattering", "mie_scattering", "mie_g", "mie_scale_height"]
+
+
+def found(*given, **options):
+    settings = {"init": toy_sky.start(1.1, 0.75), "free": FEW, "model": Toy()} | options
+    init = toy_sky.change(settings["init"], mie_absorption=0.444e-3, ozone_absorption=[0.7e-3, 1.9e-3, 0.1e-3])
+    return fit(toy_sky.observations(), **(settings | {"init": init}), priors=given)
+
+
+def test_a_vague_prior_changes_nothing():
+    plain, vague = found(), found(Prior("mie_g", 0.1, 1e3))
+    for ours, theirs in zip(vague.parameters, plain.parameters, strict=True):
+        assert ours.value == pytest.approx(theirs.value, abs=0.1 * theirs.standard_error)
+        assert ours.standard_error == pytest.approx(theirs.standard_error, rel=0.01)
+        assert ours.data_share == pytest.approx(1, abs=1e-4)
+
+
+def test_two_normal_distributions_are_combined():
+    """A linear fit and a prior of the same width meet in the middle, with half the variance, and share the precision."""
+    plain = found().estimate("mie_g")
+    away = plain.value + plain.standard_error
+    both = found(Prior("mie_g", away, plain.standard_error)).estimate("mie_g")
+    # The step is one standard error: what is not linear, and the tolerance of the fit, are a tenth of it.
+    assert both.value == pytest.approx(plain.value + plain.standard_error / 2, abs=0.15 * plain.standard_error)
+    assert both.standard_error == pytest.approx(plain.standard_error / np.sqrt(2), rel=0.02)
+    assert both.data_share == pytest.approx(0.5, abs=0.02)
+
+
+def test_a_sharp_prior_holds_a_number_and_owns_it():
+    held = found(Prior("mie_scale_height", 1.0, 1e-6, relative=True))
+    assert held.converged
+    height = held.estimate("mie_scale_height")
+    assert height.value == pytest.approx(1.0, rel=1e-4)
+    assert height.standard_error == pytest.approx(1e-6, rel=0.05)
+    assert height.data_share < 1e-3
+    # The optical depth is the images' own all the same.
+    assert held.estimate("rayleigh_optical_depth_550").data_share > 0.9
+
+
+def test_large_residuals_do_not_loosen_a_prior():
+    """The images' part of the error is three times as large, that of the prior stays."""
+    prior = Prior("mie_scale_height", 1.2, 1e-3)
+    images = toy_sky.observations(noise=0.03, stated=0.01)
+    result = fit(images, init=toy_sky.truth(), free=FEW, model=Toy(), priors=[prior])
+    assert result.error_scale == pytest.approx(3, rel=0.05)
+    assert result.estimate("mie_scale_height").standard_error == pytest.approx(1e-3, rel=0.02)
+
+
+def test_a_spectral_prior_is_one_for_each_wavelength():
+    parameters = select(toy_sky.truth(), FEW)
+    known = priors.collect([Prior("rayleigh_optical_depth", 0.1, 0.01)], parameters)
+    depth = toy_sky.truth().rayleigh_optical_depth
+    off = known.residuals(parameters.atmosphere(parameters.start))
+    np.testing.assert_allclose(off, (depth - 0.1) / 0.01, rtol=1e-4)
+    one = priors.collect([Prior("rayleigh_optical_depth_440", 0.1, 0.01)], parameters)
+    np.testing.assert_allclose(one.residuals(toy_sky.truth()), (depth[2:] - 0.1) / 0.01, rtol=1e-4)
+
+
+def test_molecular_prior_is_the_mass_of_the_air():
+    """Optical depth at 550 nm of the standard atmosphere: 0.0973 (Bodhaine et al. 1999, table 5: 0.09717 at 45° N)."""
+    stated = {prior.name: prior for prior in priors.molecular(earth())}
+    assert stated["rayleigh_optical_depth_550"].value == pytest.approx(0.0972, rel=0.005)
+    assert stated["rayleigh_scale_height"].value == pytest.approx(8.43, abs=0.01)
+    high = {prior.name: prior for prior in priors.molecular(earth(), pressure_hpa=500.0)}
+    assert high["rayleigh_optical_depth_440"].value / stated["rayleigh_optical_depth_440"].value == pytest.approx(
+        500 / 1013.25, rel=1e-6
+    )
+
+
+def test_ozone_climatology():
+    """About 260 DU at the equator, a maximum in spring at high latitudes of either hemisphere (Van Heuklon 1979, fig. 3)."""
+    of = lambda latitude, day: priors.ozone(latitude_deg=latitude, longitude_deg=0.0, day_of_year=day)[0].value
+    assert of(0.0, 100) == pytest.approx(235)
+    assert of(65.0, 90) > 400 > of(65.0, 280)
+    assert of(-60.0, 280) > of(-60.0, 90)
+
+
+def test_aerosol_types_speak_of_what_varies():
+    tied = select(earth(), ["mie_scattering", "mie_absorption", "mie_g"], {"mie": "angstrom"})
+    assert {p.name for p in priors.aerosol("urban", tied)} == {
+        "mie_single_scattering_albedo",
+        "mie_g",
+        "mie_angstrom_exponent",
+    }
+    assert [p.name for p in priors.aerosol("desert", select(earth(), ["mie_g"]))] == ["mie_g"]
+
+
+@pytest.mark.parametrize(
+    ("prior", "message"),
+    [
+        (Prior("mie_g", 0.7, 0.0), "error > 0"),
+        (Prior("mie_g", float("nan"), 0.1), "finite value"),
+        (Prior("mie_g", -0.1, 0.1, relative=True), "relative error needs a value > 0"),
+        (Prior("ozone_column", 300.0, 30.0), "does not vary in this fit"),
+        (Prior("mie_gg", 0.7, 0.1), "'mie_gg' does not vary"),
+    ],
+)
+def test_refuses(prior, message):
+    with pytest.raises(FitError, match=message):
+        priors.collect([prior], select(toy_sky.truth(), FEW))
+
+
+def test_refuses_unphysical_weather():
+    with pytest.raises(FitError, match="pressure_hpa"):
+        priors.molecular(earth(), pressure_hpa=-1.0)
+    with pytest.raises(FitError, match="latitude 100"):
+        priors.ozone(latitude_deg=100, longitude_deg=0, day_of_year=1)
+    with pytest.raises(FitError, match="continental average"):
+        priors.aerosol("smog", select(earth(), ["mie_g"]))
+
+
+def test_a_number_at_zero_has_a_finite_prior():
+    dark = toy_sky.change(toy_sky.truth(), mie_absorption=0.0)
+    parameters = select(dark, ["mie_absorption"])
+    known = priors.collect([Prior("mie_absorption", 1e-3, 0.5, relative=True)], parameters)
+    assert np.all(np.isfinite(known.residuals(parameters.atmosphere(jnp.zeros(3)))))
+
+
+def test_priors_make_the_undetermined_determined():
+    """Exposure and the sun's irradiance cannot be told apart, unless one of them is known."""
+    images = toy_sky.observations(exposure=("camera",) * 3)
+    options = {"init": toy_sky.truth(), "free": ["solar_irradiance", "mie_g"], "model": Toy()}
+    tie = {"solar_irradiance": "start"}
+    assert fit(images, **options, tie=tie).undetermined
+    sun = Prior("solar_irradiance_550", 1.0, 0.01)
+    known = fit(images, **options, tie=tie, priors=[sun])
+    assert not known.undetermined
+    assert known.estimate("exposure_camera").standard_error == pytest.approx(0.01, rel=0.05)
+    assert known.estimate("solar_irradiance_680").data_share < 1e-3
+    assert known.estimate("mie_g").data_share == pytest.approx(1, abs=1e-3)
