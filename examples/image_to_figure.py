@@ -16,8 +16,7 @@ from diffatmo import color, scene, sun
 from diffatmo.cli import shipped
 from fitting.figures import Sheet
 
-LEFT_OUT = "sky_93"
-"""The sky to be predicted: the sun 3° below the horizon."""
+LEFT_OUT = "sky_93"  # the sun 3° below the horizon
 
 # %% [markdown]
 # ## Images
@@ -101,7 +100,7 @@ prediction
 # %%
 left_out = observations[LEFT_OUT]
 chi2, pulls = prediction.reduced_chi2(left_out), prediction.pulls(left_out)
-print(f"{prediction}\nreduced χ² of {LEFT_OUT}: {chi2:.3f}")
+print(f"reduced χ² of {LEFT_OUT}: {chi2:.3f}")
 
 # %% [markdown]
 # ## The figure

@@ -22,9 +22,8 @@ from fitting.findings import Estimate, Findings
 FAR = 3.0
 """Standard errors from the truth beyond which an estimate is marked."""
 
-
-PLAIN_WIDTH = 90
-"""Columns of the plain text: the table with a truth and a number that is not determined just fits."""
+PLAIN_WIDTH = 100
+"""Columns of the plain text: enough for the table with all its columns, and a number that is not determined."""
 
 
 def format_number(value: float | None, error: float | None = None) -> str:

@@ -5,6 +5,8 @@ import dataclasses
 import functools
 import io
 import json
+import math
+import re
 import sys
 import zipfile
 
@@ -21,6 +23,7 @@ from diffatmo.models import Bruneton, Hillaire, Moments, RayMarch
 from diffatmo.phase import PhaseTable
 from diffatmo.render import Scene
 from fitting import FitError, FitResult, report, storage
+from fitting.priors import Prior
 
 PLOTS = ("images", "residuals", "correlation", "convergence")
 
@@ -35,18 +38,21 @@ def with_everything() -> FitResult:
     table = PhaseTable([0.0, 30.0, 180.0], [5.0, 1.0, 0.1])
     covariance = found.covariance.copy()
     covariance[3] = covariance[:, 3] = np.nan
-    unknown = dataclasses.replace(found.parameters[3], standard_error=None, at_bound=True)
+    unknown = dataclasses.replace(found.parameters[3], standard_error=None)
+    held = dataclasses.replace(found.parameters[4], at_bound=True, data_share=0.25)
     cameras = (toy_sky.CAMERA, camera.Fisheye(16, 64, yaw=0.1), camera.Pinhole(16, 64, fov_y=1.0, roll=0.3))
     return dataclasses.replace(
         found,
         atmosphere=dataclasses.replace(found.atmosphere, mie_phase=table),
-        parameters=[*found.parameters[:3], unknown, *found.parameters[4:]],
+        parameters=[*found.parameters[:3], unknown, held, *found.parameters[5:]],
         exposures=[fitting.Estimate("exposure_a", "exposure_a", None, "", 1.1, 0.01, None)],
         covariance=covariance,
         history=[found.history[0]._replace(chi2=float("inf"), accepted=False), *found.history],
         observations=[dataclasses.replace(o, camera=c) for o, c in zip(found.observations, cameras, strict=True)],
         undetermined=[unknown.name],
         message="stopped: Ångström's λ⁻⁴",
+        priors=[Prior("mie_g", 0.8, 0.1, source="a guess"), Prior("ground_albedo", 0.3, math.log(2), relative=True)],
+        outliers=[3, 0, 7],
         model=Moments(),
     )
 
@@ -211,7 +217,9 @@ def test_it_shows_itself_as_a_table():
     shown = repr(with_everything())
     lines = shown.splitlines()
     assert len(lines) < 50
-    assert max(map(len, lines)) <= 90
+    assert max(map(len, lines)) <= 100
+    assert re.search(r"rayleigh_scale_height +7\.9975 +not determined .*10\.4 +8\n", shown)
+    assert re.search(r"mie_scattering +680 +0\.004083 +at its bound +25 % +0\.00519 +0\.003996", shown)
     assert "…" not in shown
     assert lines[0] == "Converged after 8 iterations, reduced χ² = 1.002"
     assert "mie_single_scattering_albedo" in shown
