@@ -39,6 +39,7 @@ class Observation(eqx.Module):
 
     name: str = eqx.field(static=True)
     exposure: str = eqx.field(static=True)
+    white_balance: str = eqx.field(static=True)
     exposure_value: float
     altitude: float
     sun: Float[np.ndarray, "3"]
@@ -71,6 +72,7 @@ def observe(
     view_zenith_max: float = math.pi / 2,
     horizon_exclusion: float = 0.0,
     exposure: str = FIXED,
+    white_balance: str = FIXED,
     exposure_value: float = 1.0,
     max_pixels: int = MAX_PIXELS,
     name: str = "image",
@@ -92,6 +94,8 @@ def observe(
         horizon_exclusion: Elevations closer to 0 than this, radians, are not used.
         exposure: ``"fixed"``, ``"free"`` (a factor of this image's own), or the name of a group of images that share
             one factor; with ``-per-channel`` appended (``"free-per-channel"``) there is one for each channel.
+        white_balance: ``"fixed"``, ``"free"``, or the name of a group of images that share one: a factor for each channel but
+            the middle one by wavelength, besides the exposure.
         exposure_value: The exposure as far as it is known: pixels = exposure_value × free factor × radiance.
         max_pixels: Average blocks of pixels until no more than this many are used. The model is averaged over four
             directions in each block.
@@ -126,6 +130,9 @@ def observe(
     refuse.unless(max_pixels >= 1, "max_pixels", max_pixels, "at least 1")
     refuse.unless(bool(exposure.removesuffix(PER_CHANNEL)), "exposure", repr(exposure), '"fixed", "free" or a name')
     refuse.unless(exposure != FIXED + PER_CHANNEL, "exposure", repr(exposure), '"fixed", "free" or a name')
+    refuse.unless(bool(white_balance), "white_balance", repr(white_balance), '"fixed", "free" or a name')
+    if exposure.endswith(PER_CHANNEL) and white_balance != FIXED:
+        refuse(f"exposure: {exposure!r} has a factor for each channel already, expected white_balance fixed beside it")
 
     inside = np.asarray(camera.valid(), dtype=bool)
     zenith = np.arccos(np.clip(directions[..., 2], -1, 1))
@@ -174,6 +181,7 @@ def observe(
     return Observation(
         name=name,
         exposure=exposure,
+        white_balance=white_balance,
         exposure_value=float(exposure_value),
         altitude=float(altitude),
         sun=toward_sun / np.linalg.norm(toward_sun),
@@ -274,13 +282,14 @@ class Batch(eqx.Module):
     noise_shot: Float[Array, "image pixel w"]
     noise_floor: Float[Array, "image pixel w"]
     exposure_value: Float[Array, " image"]
-    exposure_index: Int[Array, "image w"]
+    exposure_index: Int[Array, "image w 2"]
+    """Numbers of the free factors of exposure and of white balance."""
     exposure_count: int = eqx.field(static=True)
 
     def exposure(self, log_factors: Float[Array, " e"]) -> Float[Array, "image 1 w"]:
         """What radiance is multiplied by, from the logarithms of the free factors."""
         logs = jnp.concatenate([log_factors, jnp.zeros(1, log_factors.dtype)])
-        return (self.exposure_value[:, None] * jnp.exp(logs[self.exposure_index]))[:, None]
+        return (self.exposure_value[:, None] * jnp.exp(jnp.sum(logs[self.exposure_index], axis=-1)))[:, None]
 
 
 def exposure_name(observation: Observation) -> str | None:
@@ -293,22 +302,38 @@ def exposure_name(observation: Observation) -> str | None:
 
 def exposures(
     observations: Sequence[Observation], wavelengths: Sequence[float]
-) -> tuple[list[str], Int[np.ndarray, "image w"]]:
-    """Names of the free exposure factors, and for each image and channel the factor's number, -1 where it is fixed."""
-    own = {exposure_name(o) for o in observations if o.exposure.removesuffix(PER_CHANNEL) == FREE}
-    shared = {exposure_name(o) for o in observations if o.exposure.removesuffix(PER_CHANNEL) != FREE}
-    if both := own & shared - {None}:
-        raise FitError(f"{both.pop()}: an image with a free exposure has the name of a group; rename the group")
+) -> tuple[list[str], Int[np.ndarray, "image w 2"]]:
+    """Names of the free factors, and for each image and channel the numbers of those of its exposure and of its white balance.
+
+    -1 stands for a fixed one.
+    """
+    _check_groups(observations, [o.exposure.removesuffix(PER_CHANNEL) for o in observations])
+    _check_groups(observations, [o.white_balance for o in observations])
     factors: dict[str, int] = {}
-    index = np.full((len(observations), len(wavelengths)), -1)
+    index = np.full((len(observations), len(wavelengths), 2), -1)
     for image, observation in enumerate(observations):
         name = exposure_name(observation)
         if name is None:
             continue
         for channel, nm in enumerate(wavelengths):
             channel_name = f"{name}_{nm:g}" if observation.exposure.endswith(PER_CHANNEL) else name
-            index[image, channel] = factors.setdefault(channel_name, len(factors))
+            index[image, channel, 0] = factors.setdefault(channel_name, len(factors))
+    middle = int(np.argsort(wavelengths)[(len(wavelengths) - 1) // 2])
+    for image, observation in enumerate(observations):
+        if observation.white_balance == FIXED:
+            continue
+        group = observation.name if observation.white_balance == FREE else observation.white_balance
+        for channel, nm in enumerate(wavelengths):
+            if channel != middle:
+                index[image, channel, 1] = factors.setdefault(f"white_balance_{group}_{nm:g}", len(factors))
     return list(factors), index
+
+
+def _check_groups(observations: Sequence[Observation], groups: Sequence[str]) -> None:
+    """Refuse an image with a factor of its own whose name is that of a group, which would then share it."""
+    own = {observation.name for observation, group in zip(observations, groups, strict=True) if group == FREE}
+    if both := own & set(groups):
+        raise FitError(f"{both.pop()}: an image with a free factor has the name of a group; rename the group")
 
 
 def stack(observations: Sequence[Observation], wavelengths: Sequence[float]) -> Batch:

@@ -65,7 +65,7 @@ from fitting.figures import (
     residual_scale,
 )
 from fitting.findings import Estimate, Findings
-from fitting.observation import PER_CHANNEL, Observation, exposure_name
+from fitting.observation import FIXED, PER_CHANNEL, Observation, exposure_name
 from fitting.storage import installed_version
 from fitting.tables import notes, page_table, table, verdict
 
@@ -143,8 +143,8 @@ def write(
 
 
 def scene_of(result: Findings, observation: Observation) -> Scene | None:
-    """The scene of a fitted image; None if its pixels are not the camera's, or have an exposure for each channel."""
-    if observation.block > 1 or observation.exposure.endswith(PER_CHANNEL):
+    """The scene of a fitted image; None if its pixels are not the camera's, or have a factor for each channel."""
+    if observation.block > 1 or observation.exposure.endswith(PER_CHANNEL) or observation.white_balance != FIXED:
         return None
     name = exposure_name(observation)
     factor = 1.0 if name is None else result.estimate(name).value
@@ -245,6 +245,7 @@ def _image_record(result: Findings, number: int) -> dict[str, Any]:
         "sun_zenith_deg": zenith,
         "sun_azimuth_deg": azimuth,
         "exposure": observation.exposure,
+        "white_balance": observation.white_balance,
         "exposure_value": observation.exposure_value,
         "pixels_used": len(relative),
         "pixels_masked": observation.masked,

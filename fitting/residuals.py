@@ -130,7 +130,7 @@ def jacobian(
     expected = linearisation.radiance * exposure
     touched = (channel == -1) | (np.arange(expected.shape[-1])[:, None] == channel)
     of_atmosphere = jnp.where(touched, linearisation.tangents[..., colour], 0) * exposure[..., None]
-    own = batch.exposure_index[:, None, :, None] == jnp.arange(batch.exposure_count)
+    own = jnp.any(batch.exposure_index[:, None, :, :, None] == jnp.arange(batch.exposure_count), axis=-2)
     of_exposure = jnp.where(own, expected[..., None], 0)
     slope = jnp.concatenate([of_atmosphere, of_exposure], axis=-1)
     slope = jnp.where(batch.used[..., None, None], slope, 0) * problem.weight[..., None]

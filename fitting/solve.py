@@ -446,11 +446,11 @@ def _expected(y: Coordinates, linearisation: Linearisation, problem: Problem) ->
 
 
 def _starting_exposures(radiance: np.ndarray, batch: Batch) -> Float[np.ndarray, " e"]:
-    """Logarithms of the factors that bring the median of measured / expected to one."""
+    """Logarithms of the exposures that bring the median of measured / expected to one, with a neutral white balance."""
     expected = radiance * np.asarray(batch.exposure_value)[:, None, None]
     ratio = np.asarray(batch.measured) / np.where(expected > 0, expected, np.inf)
     usable = np.asarray(batch.used)[..., None] & (ratio > 0) & np.isfinite(ratio)
-    index = np.broadcast_to(np.asarray(batch.exposure_index)[:, None], ratio.shape)
+    index = np.broadcast_to(np.asarray(batch.exposure_index)[:, None, :, 0], ratio.shape)
     chosen = [ratio[usable & (index == number)] for number in range(batch.exposure_count)]
     return np.array([np.log(np.median(values)) if values.size else 0.0 for values in chosen])
 

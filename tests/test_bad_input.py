@@ -226,7 +226,6 @@ CASES = {
     # many fits
     "folder without images": (["fit", "FOLDER.exr"], "FOLDER.exr: no image in this folder"),
     "each of nothing": (["fit", "--each"], "--each"),
-    "resume of one fit": (["fit", "GOOD.exr", "--resume"], "--resume"),
     "jobs of one fit": (["fit", "GOOD.exr", "--jobs", "2"], "--jobs"),
     "no jobs": (["fit", "GOOD.exr", "--each", "--jobs", "0"], "--jobs"),
     "resume and overwrite": (["fit", "GOOD.exr", "--each", "--resume", "--overwrite"], "contradict"),

@@ -169,14 +169,28 @@ def test_exposure_groups():
         *("exposure_i1", "exposure_camera"),
         *(f"exposure_{own}_{nm}" for own in ("i4", "lens") for nm in (680, 550, 440)),
     ]
-    assert index.tolist() == [[-1] * 3, [0] * 3, [1] * 3, [1] * 3, [2, 3, 4], [5, 6, 7]]
+    assert index[..., 0].tolist() == [[-1] * 3, [0] * 3, [1] * 3, [1] * 3, [2, 3, 4], [5, 6, 7]]
+    assert np.all(index[..., 1] == -1)
     factors = stack(images, NM).exposure(jnp.log(jnp.arange(1.0, 9.0)))
     np.testing.assert_allclose(factors[:, 0, 0], [2, 2, 4, 4, 6, 12], rtol=1e-6)
+
+
+def test_white_balance_leaves_the_middle_channel():
+    given = [("free", "fixed"), ("free", "lens"), ("body", "lens"), ("body", "free")]
+    images = [observe(name=f"i{n}", exposure=e, white_balance=w) for n, (e, w) in enumerate(given)]
+    names, index = exposures(images, NM)
+    assert names[:3] == ["exposure_i0", "exposure_i1", "exposure_body"]
+    assert names[3:] == [f"white_balance_{own}_{nm}" for own in ("lens", "i3") for nm in (680, 440)]
+    assert index[..., 1].tolist() == [[-1] * 3, [3, -1, 4], [3, -1, 4], [5, -1, 6]]
+    factors = stack(images, NM).exposure(jnp.log(jnp.array([1.0, 2.0, 3.0, 10.0, 20.0, 5.0, 7.0])))
+    np.testing.assert_allclose(factors[:, 0], [[1, 1, 1], [20, 2, 40], [30, 3, 60], [15, 3, 21]], rtol=1e-6)
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
+        ({"exposure": "free-per-channel", "white_balance": "lens"}, "a factor for each channel already"),
+        ({"white_balance": ""}, "white_balance: got ''"),
         ({"pixels": np.ones((32, 64))}, "expected numbers in the shape"),
         ({"pixels": np.ones((32, 63, 3))}, "63 x 32 .* and the camera 64 x 32"),
         ({"pixels": np.zeros((32, 64, 3))}, "no pixel is left to fit: of 2048 pixels .* black"),

@@ -82,6 +82,21 @@ def test_free_exposures_are_recovered():
         assert estimate.standard_error < 0.01 * factor
 
 
+def test_exposures_and_a_shared_white_balance_are_recovered():
+    """Of every image its own exposure, of all one lens: three factors and two, besides the atmosphere."""
+    images = toy_sky.observations(factors=(20.0, 0.05, 1.0), exposure=("free",) * 3, white_balance="lens")
+    for image in images:
+        image.image[:] *= np.array([1.5, 1.0, 0.7], np.float32)
+    free = ["mie_g", "mie_scattering"]
+    found = fit(images, init=toy_sky.start(1.0, 0.6), free=free, tie={"mie_scattering": "grey"}, model=Toy())
+    assert found.converged
+    red, blue = (found.estimate(f"white_balance_lens_{nm}") for nm in (680, 440))
+    for estimate, factor in ((red, 1.5), (blue, 0.7), (found.estimate("exposure_sun 60"), 0.05)):
+        assert abs(estimate.value - factor) < 4 * estimate.standard_error
+        assert estimate.standard_error < 0.01 * factor
+    assert abs(found.estimate("mie_g").value - 0.8) < 4 * found.estimate("mie_g").standard_error
+
+
 def test_out_of_steps_returns_the_best_point():
     found = fit(toy_sky.observations(), init=toy_sky.start(), free=FREE, model=Toy(), max_steps=3)
     assert not found.converged

@@ -48,7 +48,9 @@ def observe(spec: ImageSpec, name: str, init: "Atmosphere") -> Seen:
     try:
         pixels = in_order(image, init)
         camera = find_camera(options, pixels, shot)
-        chosen: dict[str, Any] = {key: options[key] for key in ("exposure", "saturation") if key in options}
+        chosen: dict[str, Any] = {
+            key: options[key] for key in ("exposure", "white_balance", "saturation") if key in options
+        }
         chosen |= {
             key.removesuffix("_deg"): math.radians(options[key])
             for key in ("view_zenith_max_deg", "sun_exclusion_deg", "horizon_exclusion_deg")

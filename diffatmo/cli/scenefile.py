@@ -31,6 +31,7 @@ IMAGE_KEYS: dict[str, Key] = {
     "exposure": Word(
         "fixed, free, free-per-channel, or the name of a group of images that share one.  [default: fixed]"
     ),
+    "white_balance": Word("fixed, free, or the name of a group of images that share one.  [default: fixed]"),
     "noise": Number("Relative standard deviation per pixel and channel.  [default: 0.01]", 0, 10),
     "noise_shot": Number("Variance per unit of signal (photon noise).  [default: 0]", 0, 1e30),
     "noise_floor": Number("Standard deviation of a dark pixel (read noise).  [default: 1e-4 of the median]", 0, 1e30),
