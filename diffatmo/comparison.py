@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -29,7 +30,7 @@ REPEATS = 3
 
 
 class Outcome(NamedTuple):
-    """A picture of a scene by one model, and its price on this machine."""
+    """A picture of a scene by one model, 0 outside a fisheye's circle, and its price on this machine."""
 
     picture: Picture
     stderr: Picture | None
@@ -72,7 +73,8 @@ def _prepare(model: Model, scene: Scene) -> Sky:
 
 
 def _look(sky: Sky, scene: Scene) -> jax.Array:
-    return sky.view(altitude=scene.altitude, sun=scene.sun).radiance(view=scene.camera.directions()).radiance
+    light = sky.view(altitude=scene.altitude, sun=scene.sun).radiance(view=scene.camera.directions()).radiance
+    return jnp.where(scene.camera.valid()[..., None], light, 0)
 
 
 def run(scene: Scene, model: Model) -> Outcome:
@@ -85,7 +87,9 @@ def run(scene: Scene, model: Model) -> Outcome:
         light, error, _ = jax.block_until_ready(
             sky.radiance_with_error(altitude=scene.altitude, view=view, sun=scene.sun)
         )
-        return Outcome(np.asarray(light), np.asarray(error), 0.0, prepared - start, time.perf_counter() - prepared)
+        traced = time.perf_counter()
+        light, error = (np.where(scene.camera.valid()[..., None], x, 0) for x in (light, error))
+        return Outcome(light, error, 0.0, prepared - start, traced - prepared)
     solved, compiled, prepare_s = _timed(outermost(_prepare), model, scene, repeats=REPEATS)
     picture, also_compiled, image_s = _timed(outermost(_look), solved, scene, repeats=REPEATS)
     return Outcome(np.asarray(picture), None, compiled + also_compiled, prepare_s, image_s)

@@ -9,17 +9,29 @@ from jaxtyping import Array, Float
 
 from diffatmo import geometry
 from diffatmo import sun as sunlight
-from diffatmo._types import Direction, Radiance, Scalar
+from diffatmo._types import Direction, Length, Radiance, Scalar
 from diffatmo.atmosphere import Atmosphere
 from diffatmo.camera import Camera
 from diffatmo.constants import SUN_ANGULAR_RADIUS
-from diffatmo.models import Model, Moments, Path, View
+from diffatmo.models import Model, Moments, Path, PathTrace, View
 
 TILE_PIXELS = 2**16
 """Pixels computed at a time; bounds the memory of a large picture."""
 
 TILE_PATHS = 2**12
 """Rays to a given depth computed at a time: each is integrated on its own."""
+
+
+def _rows(camera: Camera, model: Model | None, pixels: int) -> int:
+    """Rows of a picture to be computed at a time, ``pixels`` or less.
+
+    The path tracer bounds its memory itself, and it gives each ray of *one* question random numbers of its own: asked row by
+    row, it would repeat its noise in every row.
+    """
+    if isinstance(model, PathTrace):
+        return camera.height
+    return min(max(1, pixels // camera.width), camera.height)
+
 
 RESOLVED = 20.0
 """Diameter of the sun in pixels from which its disc is evaluated pixel by pixel."""
@@ -74,8 +86,8 @@ def render(
         return ray.radiance + jnp.where(resolved, disc * _clear(scene, directions, ray.transmittance), 0)
 
     directions = scene.camera.directions()
-    rows = max(1, TILE_PIXELS // scene.camera.width)
-    whole = rows >= scene.camera.height
+    rows = _rows(scene.camera, model, TILE_PIXELS)
+    whole = rows == scene.camera.height
     picture = tile(directions) if whole else jax.lax.map(tile, directions, batch_size=rows)
     if sun_disc:
         picture = picture + jnp.where(resolved, 0, _small_sun(scene, view, sun_angular_radius))
@@ -94,14 +106,17 @@ def aerial_perspective(scene: Scene, depth: Float[Array, "height width"], model:
     # Finite, so that the derivative in depth is as well; no ray inside an atmosphere is longer than its circumference.
     longest = 2 * jnp.pi * (scene.atmosphere.top_radius + scene.altitude)
 
-    def tile(row: tuple[Array, Array]) -> Path:
-        directions, far = row
+    def tile(directions: Direction, far: Length) -> Path:
         mu, nu = directions[..., 2], directions @ scene.sun
         level, mu_s = (jnp.broadcast_to(jnp.asarray(x, mu.dtype), mu.shape) for x in (scene.altitude, scene.sun[2]))
         return sky.path(altitude=level, mu=mu, mu_s=mu_s, nu=nu, distance=jnp.clip(far, 0, longest))
 
-    rows = max(1, TILE_PATHS // scene.camera.width)
-    path = jax.lax.map(tile, (scene.camera.directions(), jnp.asarray(depth)), batch_size=min(rows, scene.camera.height))
+    rows = _rows(scene.camera, model, TILE_PATHS)
+    directions, depth = scene.camera.directions(), jnp.asarray(depth)
+    whole = rows == scene.camera.height
+    path = (
+        tile(directions, depth) if whole else jax.lax.map(lambda row: tile(*row), (directions, depth), batch_size=rows)
+    )
     valid = scene.camera.valid()[..., None]
     return Path(jnp.where(valid, scene.exposure * path.inscatter, 0), jnp.where(valid, path.transmittance, 1))
 

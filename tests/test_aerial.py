@@ -88,3 +88,11 @@ def test_path_tracer_agrees(s1):
     ratio = np.asarray(got.inscatter / truth.inscatter)
     assert abs(ratio.mean() - 1) < 0.01
     np.testing.assert_allclose(got.transmittance, truth.transmittance, atol=2e-3)
+
+
+def test_path_tracer_draws_every_pixel_anew():
+    """A lens so long that all pixels see the same: what differs is noise, as much between rows as within them."""
+    scene = replace(SCENE, camera=Pinhole(8, 8, pitch=0.05, fov_y=1e-4))
+    light = np.asarray(aerial_perspective(scene, jnp.full((8, 8), 15.0), PathTrace(samples=64)).inscatter)
+    assert light.std(axis=0).mean() == pytest.approx(light.std(axis=1).mean(), rel=0.3)
+    assert len(np.unique(light[..., 0])) == 64

@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from toy_sky import Toy
 
 import diffatmo
 from diffatmo import comparison, scene, sun
@@ -69,6 +70,15 @@ def test_the_sun_and_the_horizon(place):
     assert (view[masks["ground"]][:, 2] < 0).all()
     assert (view[masks["sky"]] @ np.asarray(place.sun)).max() < np.cos(np.radians(3))
     assert masks["horizon"].sum() < masks["sky"].sum()
+
+
+def test_outside_the_circle_there_is_nothing():
+    """The corners of a fisheye's picture are dark, and no error is told of them."""
+    round_one = diffatmo.Scene(diffatmo.earth(), diffatmo.Fisheye(16, 16), 0.1, sun.direction(zenith=1.0, azimuth=0.0))
+    seen = comparison.run(round_one, Toy())
+    inside = np.asarray(round_one.camera.valid())
+    assert (seen.picture[~inside] == 0).all()
+    assert (np.isfinite(comparison.relative(seen, seen)).all(axis=-1) == inside).all()
 
 
 def test_the_command(tmp_path, capsys):
