@@ -7,11 +7,22 @@
     fitting.report.write(result, "out")
 """
 
-from fitting import report
+from fitting import planning, report
 from fitting._errors import FitError
 from fitting.observation import Observation, observe
 from fitting.parameters import FREE_FIELDS
 from fitting.solve import Step
 from fitting.uncertainty import Estimate, FitResult, fit
 
-__all__ = ["FREE_FIELDS", "Estimate", "FitError", "FitResult", "Observation", "Step", "fit", "observe", "report"]
+__all__ = [
+    "FREE_FIELDS",
+    "Estimate",
+    "FitError",
+    "FitResult",
+    "Observation",
+    "Step",
+    "fit",
+    "observe",
+    "planning",
+    "report",
+]

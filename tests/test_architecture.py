@@ -43,7 +43,7 @@ LEVELS = [
     ["fitting.residuals"],
     ["fitting.solve"],
     ["fitting.uncertainty"],
-    ["fitting.report"],
+    ["fitting.report", "fitting.planning"],
     ["fitting"],
     ["diffatmo"],  # the lazy public interface
     ["diffatmo.cli", "diffatmo.cli.cache", "diffatmo.cli.common"],
@@ -51,7 +51,7 @@ LEVELS = [
     ["diffatmo.cli.scenefile"],
     ["diffatmo.cli.images"],
     ["diffatmo.cli.radiance", "diffatmo.cli.render", "diffatmo.cli.fit"],
-    ["diffatmo.cli.compare", "diffatmo.cli.export"],
+    ["diffatmo.cli.compare", "diffatmo.cli.export", "diffatmo.cli.plan"],
     ["diffatmo.cli.main"],
     ["diffatmo.__main__"],
 ]

@@ -16,6 +16,7 @@ from diffatmo.cli.scenefile import FREE, IMAGE_KEYS, MODELS, FitSpec, ImageSpec,
 
 if TYPE_CHECKING:
     from diffatmo.atmosphere import Atmosphere
+    from diffatmo.models import Model
     from fitting import Observation, Step
 
 NOT_CONVERGED = 1
@@ -145,12 +146,18 @@ def image_names(images: Sequence[ImageSpec]) -> list[str]:
     return names
 
 
+def fitting_model(name: str) -> "Model":
+    """The model called ``name``, at the resolution that fits use."""
+    from diffatmo.models import Bruneton
+
+    return Bruneton.reduced() if name == "bruneton" else make_model(name)
+
+
 def run(job: Job, directory: Path, *, overwrite: bool) -> bool:
     """Fit, write the report, show the table; whether the fit converged."""
     from rich.console import Console
 
     import fitting
-    from diffatmo.models import Bruneton
     from fitting import report
 
     console = Console(width=None if sys.stdout.isatty() else PLAIN_WIDTH, highlight=False)
@@ -172,7 +179,7 @@ def run(job: Job, directory: Path, *, overwrite: bool) -> bool:
             init=job.init,
             free=job.free,
             tie=job.tie,
-            model=Bruneton.reduced() if job.model == "bruneton" else make_model(job.model),
+            model=fitting_model(job.model),
             progress=show,
             max_steps=job.max_steps,
             refine=job.refine,
