@@ -9,7 +9,7 @@
     fitting.report.write(result, "out")
 """
 
-from fitting import priors, report
+from fitting import planning, priors, report
 from fitting._errors import FitError
 from fitting.findings import Estimate
 from fitting.observation import Observation, observe
@@ -31,6 +31,7 @@ __all__ = [
     "Step",
     "fit",
     "observe",
+    "planning",
     "priors",
     "report",
 ]

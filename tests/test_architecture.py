@@ -48,6 +48,7 @@ LEVELS = [
     ["fitting.tables", "fitting.figures", "fitting.prediction", "fitting.storage"],
     ["fitting.report", "fitting.result"],
     ["fitting.uncertainty"],
+    ["fitting.planning"],
     ["fitting"],
     ["diffatmo"],  # the lazy public interface
     ["diffatmo.cli", "diffatmo.cli.cache", "diffatmo.cli.common", "diffatmo.cli.workers"],
@@ -56,7 +57,7 @@ LEVELS = [
     ["diffatmo.cli.images", "diffatmo.cli.origin"],
     ["diffatmo.cli.many"],
     ["diffatmo.cli.radiance", "diffatmo.cli.render", "diffatmo.cli.fit"],
-    ["diffatmo.cli.compare", "diffatmo.cli.export"],
+    ["diffatmo.cli.compare", "diffatmo.cli.export", "diffatmo.cli.plan"],
     ["diffatmo.cli.main"],
     ["diffatmo.__main__"],
 ]

@@ -15,6 +15,7 @@ from diffatmo.cli.scenefile import FREE, IMAGE_KEYS, LOSSES, MODELS, FitSpec, Im
 
 if TYPE_CHECKING:
     from diffatmo.atmosphere import Atmosphere
+    from diffatmo.models import Model
     from fitting import Observation, Prior, Step
     from fitting.parameters import Parameters
 
@@ -222,12 +223,18 @@ def image_names(images: Sequence[ImageSpec]) -> list[str]:
     return names
 
 
+def fitting_model(name: str) -> "Model":
+    """The model called ``name``, at the resolution that fits use."""
+    from diffatmo.models import Bruneton
+
+    return Bruneton.reduced() if name == "bruneton" else make_model(name)
+
+
 def run(job: Job, directory: Path, *, overwrite: bool, quiet: bool = False) -> bool:
     """Fit, write the report, show the table unless ``quiet``; whether the fit converged."""
     from rich.text import Text
 
     import fitting
-    from diffatmo.models import Bruneton
     from fitting import checkpoint, report
     from fitting.solve import INTERRUPTED
 
@@ -256,7 +263,7 @@ def run(job: Job, directory: Path, *, overwrite: bool, quiet: bool = False) -> b
             tie=job.tie,
             priors=job.priors,
             loss=job.loss,
-            model=Bruneton.reduced() if job.model == "bruneton" else make_model(job.model),
+            model=fitting_model(job.model),
             progress=show,
             max_steps=job.max_steps,
             refine=job.refine,

@@ -109,25 +109,27 @@ def check_image_options(options: Mapping[str, Any]) -> None:
     check_camera_options(options)
 
 
-def read_scene(path: Path) -> FitSpec:
-    """Read a scene file; relative paths in it are relative to it."""
+def read_scene(path: Path, *, least: int = 1) -> FitSpec:
+    """Read a scene file with at least so many images; relative paths in it are relative to it."""
     try:
         data = tomllib.loads(path.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: not a TOML file: {error}") from error
     try:
-        return _scene(data, path.parent)
+        return _scene(data, path.parent, least)
     except OverflowError as error:
         raise InputError(f"{path}: a number is too large: {error}") from error
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
 
 
-def _scene(data: Mapping[str, Any], directory: Path) -> FitSpec:
+def _scene(data: Mapping[str, Any], directory: Path, least: int) -> FitSpec:
     _refuse_unknown(data, SCENE_KEYS)
     tables = data.get("image", [])
-    if not isinstance(tables, list) or not tables or not all(isinstance(table, dict) for table in tables):
-        raise InputError("image: expected at least one [[image]] table")
+    if not isinstance(tables, list) or not all(isinstance(table, dict) for table in tables):
+        raise InputError("image: expected [[image]] tables")
+    if len(tables) < least:
+        raise InputError(f"image: got {len(tables)} [[image]] tables, expected at least {least}")
     images = []
     for number, table in enumerate(tables, start=1):
         try:
