@@ -26,6 +26,9 @@ SUN_DEG = 3.0
 DARK = 1e-5
 """Pixels darker than this part of the brightest are left out: of the unlit, a relative error says nothing."""
 
+UNLIT = 1e-12
+"""So are those darker than this part of the solar irradiance per steradian: there is more light from other stars."""
+
 REPEATS = 3
 
 
@@ -105,15 +108,16 @@ def regions(scene: Scene) -> dict[str, Mask]:
     return {"sky": sky, "horizon": sky & (elevation < HORIZON_DEG), "ground": valid & (elevation <= 0)}
 
 
-def relative(outcome: Outcome, truth: Outcome) -> Picture:
+def relative(scene: Scene, outcome: Outcome, truth: Outcome) -> Picture:
     """Signed relative difference to the truth; NaN where that is dark."""
-    seen = truth.picture > DARK * truth.picture.max()
+    unlit = UNLIT * np.asarray(scene.atmosphere.solar_irradiance)
+    seen = truth.picture > np.maximum(unlit, DARK * truth.picture.max())
     return np.where(seen, outcome.picture / np.where(seen, truth.picture, 1) - 1, np.nan)
 
 
 def errors(scene: Scene, outcome: Outcome, truth: Outcome) -> Errors:
     """How far ``outcome`` is from ``truth``."""
-    off, masks = relative(outcome, truth), regions(scene)
+    off, masks = relative(scene, outcome, truth), regions(scene)
     weights = np.broadcast_to(np.asarray(scene.camera.solid_angles())[..., None], off.shape)
 
     def average(values: Picture, mask: Mask) -> float:

@@ -2,6 +2,8 @@
 
 import json
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from toy_sky import Toy
@@ -10,6 +12,7 @@ import diffatmo
 from diffatmo import comparison, scene, sun
 from diffatmo.cli.main import main
 from diffatmo.comparison import Outcome
+from diffatmo.models import Model
 
 
 @pytest.fixture
@@ -60,6 +63,9 @@ def test_the_dark_is_left_out(place):
     found = comparison.errors(place, outcome(truth + 1e-7), outcome(truth))
     assert np.isnan(found.ground)
     assert found.rms < 1e-6
+    # A night as numbers have it: the brightest is 1e-14, and that is no truth either.
+    night = comparison.errors(place, outcome(2e-14 * truth), outcome(1e-14 * truth))
+    assert np.isnan(night.rms)
 
 
 def test_the_sun_and_the_horizon(place):
@@ -78,7 +84,7 @@ def test_outside_the_circle_there_is_nothing():
     seen = comparison.run(round_one, Toy())
     inside = np.asarray(round_one.camera.valid())
     assert (seen.picture[~inside] == 0).all()
-    assert (np.isfinite(comparison.relative(seen, seen)).all(axis=-1) == inside).all()
+    assert (np.isfinite(comparison.relative(round_one, seen, seen)).all(axis=-1) == inside).all()
 
 
 def test_the_command(tmp_path, capsys):
@@ -98,6 +104,44 @@ def test_the_command(tmp_path, capsys):
     assert (folder / "compare.html").read_text().count("<img") == 1
     assert main(["compare", "earth", "-o", str(folder)]) == 2
     assert "--overwrite" in capsys.readouterr().err
+
+
+class Nothing(Model):
+    """Fails as soon as it is asked."""
+
+    def sky(self, atmosphere):
+        raise KeyboardInterrupt
+
+
+def test_what_was_computed_is_kept(tmp_path, monkeypatch):
+    """Interrupted in the second model, the picture of the first one is there."""
+    made = {"moments": Toy(), "pathtrace": Nothing()}
+    monkeypatch.setattr("diffatmo.cli.compare.make_model", lambda name, **_: made[name])
+    folder = tmp_path / "out"
+    main(["compare", "earth", "-o", str(folder), "--models", "moments,pathtrace", "--width", "8"])
+    assert [f.name for f in folder.iterdir()] == ["picture_moments.exr"]
+
+
+def test_a_night_has_no_errors(tmp_path, monkeypatch, capsys):
+    """No light by any model: dashes in the table, null in the file, and a sheet all the same."""
+
+    class Dark(Model):
+        def sky(self, atmosphere):
+            return eqx.tree_at(lambda sky: sky.atmosphere.solar_irradiance, Toy().sky(atmosphere), jnp.zeros(3))
+
+    monkeypatch.setattr("diffatmo.cli.compare.make_model", lambda name, **_: Dark())
+    folder = tmp_path / "out"
+    assert main(["compare", "earth", "-o", str(folder), "--models", "moments,hillaire", "--width", "8"]) == 0
+    assert "–" in capsys.readouterr().out
+    assert json.loads((folder / "compare.json").read_text())["models"]["hillaire"]["rms"] is None
+    assert (folder / "compare.png").stat().st_size > 0
+
+
+@pytest.mark.parametrize("command", [["compare"], ["export", "--luts", "hillaire"]])
+def test_no_folder_for_an_atmosphere_that_is_not_there(command, tmp_path, capsys):
+    assert main([*command, "nosuch.toml", "-o", str(tmp_path / "out")]) == 2
+    assert "nosuch.toml" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(

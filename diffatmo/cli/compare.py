@@ -92,19 +92,24 @@ def compare(
     """
     given = CENTRED | keys.given(CAMERA_KEYS | PLACE_KEYS, values)
     keys.check_camera_options(given)
-    folders.prepare(output, names=FILES, prefixes=PREFIXES, overwrite=overwrite)
     names = list(dict.fromkeys([truth, *models]))
+    air = read_atmosphere(atmosphere)
+    folders.prepare(output, names=FILES, prefixes=PREFIXES, overwrite=overwrite)
     from rich.console import Console
 
     from diffatmo import comparison
+    from diffatmo import scene as scenes
 
-    scene = make_scene(read_atmosphere(atmosphere), given, width, height)
+    scene = make_scene(air, given, width, height)
     console = Console(width=None if Console().is_terminal else 120)
     outcomes: dict[str, Outcome] = {}
     for name in names:
         with console.status(f"{name} …"):
             chosen = make_model(name, samples=samples if name == "pathtrace" else None)
             outcomes[name] = comparison.run(scene, chosen)
+            # At once: the next model may take long, and may be interrupted.
+            path, notes = output / f"picture_{name}.exr", {"model": name}
+            scenes.save(path, outcomes[name].picture, scene, notes=notes, overwrite=True)
     found = {name: comparison.errors(scene, outcome, outcomes[truth]) for name, outcome in outcomes.items()}
     _write(output, scene, outcomes, found, truth)
     console.print(_table(outcomes, found, truth))
@@ -152,10 +157,11 @@ def _sheet(scene: "Scene", outcomes: "dict[str, Outcome]", truth: str) -> "Figur
 
     wavelengths = scene.atmosphere.wavelengths
     exposure = color.auto_exposure(color.to_linear_srgb(jnp.asarray(outcomes[truth].picture), wavelengths=wavelengths))
-    errors = {name: comparison.relative(outcome, outcomes[truth]) for name, outcome in outcomes.items()}
+    errors = {name: comparison.relative(scene, outcome, outcomes[truth]) for name, outcome in outcomes.items()}
     bands = [0, wavelengths.size // 2, wavelengths.size - 1] if wavelengths.size > 3 else list(range(wavelengths.size))
     # One scale for all: what most pixels of the worst but one model are within.
-    ends = sorted(float(np.nanpercentile(np.abs(e), 98)) for name, e in errors.items() if name != truth)
+    lit = {name: e[np.isfinite(e)] for name, e in errors.items() if name != truth}
+    ends = sorted(float(np.percentile(np.abs(e), 98)) for e in lit.values() if e.size)
     scale = max(ends[-2] if len(ends) > 1 else ends[-1] if ends else 0.01, 1e-4)
     rows = 1 + len(bands)
     shape = scene.camera.height / scene.camera.width
@@ -189,10 +195,9 @@ def _write(
     from fitting import report
 
     for name, outcome in outcomes.items():
-        scenes.save(directory / f"picture_{name}.exr", outcome.picture, scene, notes={"model": name}, overwrite=True)
         if name != truth:
             notes = {"model": name, "relative_to": truth}
-            off = comparison.relative(outcome, outcomes[truth])
+            off = comparison.relative(scene, outcome, outcomes[truth])
             scenes.save(directory / f"error_{name}.exr", off, scene, notes=notes, overwrite=True)
     sheet = _sheet(scene, outcomes, truth)
     with imageio.atomic_write(directory / "compare.png", overwrite=True) as path:

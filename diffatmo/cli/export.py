@@ -71,6 +71,7 @@ def export(
         raise InputError(f"{keys.flag_of(name)} contradicts --luts {luts}: it belongs to the other one")
     options = VIEWED | of_place
     keys.check_camera_options(options)
+    air = read_atmosphere(atmosphere)
     folders.prepare(output, names=FOLDERS, overwrite=overwrite)
     from rich.console import Console
     from rich.table import Table
@@ -78,7 +79,6 @@ def export(
     from diffatmo import export as tables
     from diffatmo import imageio
 
-    air = read_atmosphere(atmosphere)
     console = Console(width=None if Console().is_terminal else 120)
     with console.status("computing the tables …"):
         if luts == "bruneton":
