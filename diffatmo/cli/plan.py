@@ -196,28 +196,35 @@ def _gain(value: float) -> str:
 
 
 def _rows(found: "Plan", exposure: str) -> list[list[str]]:
-    """The ranking as text: shot, gain, gain with the other exposure, what gains most."""
+    """The ranking as text, under :func:`_headings`."""
     rows = []
     for number, (mine, other) in enumerate(_ranked(found, exposure), start=1):
         most = sorted(mine.gains.items(), key=lambda item: -item[1])[:2]
         named = ", ".join(f"{name} {_gain(gain)}" for name, gain in most if gain > 1.005)
-        rows.append([str(number), mine.shot.name, _gain(mine.gain), _gain(other.gain), named])
+        sun = f"{math.degrees(mine.shot.sun_zenith):g}°"
+        rows.append([str(number), mine.shot.kind, sun, _gain(mine.gain), _gain(other.gain), named])
     return rows
 
 
 def _headings(exposure: str) -> list[str]:
-    return ["", "shot", f"gain, {_called(exposure)}", _called(_other(exposure)), "gains most"]
+    return ["", "shot", "sun at", "gain", f"with {_called(_other(exposure))}", "gains most"]
 
 
 def _ranking(found: "Plan", exposure: str) -> "Table":
+    from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
-    table = Table(title="What one more photograph buys: error bars shrink by")
+    table = Table(title=_title(exposure), box=SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False, title_justify="left")
     for heading in _headings(exposure):
-        table.add_column(heading, justify="left" if heading in ("shot", "gains most") else "right")
+        side: Any = "left" if heading in ("shot", "gains most") else "right"
+        table.add_column(heading.replace(" exposure", "\nexposure"), justify=side)
     for row in _rows(found, exposure)[:SHOWN]:
         table.add_row(*row)
     return table
+
+
+def _title(exposure: str) -> str:
+    return f"Error bars shrink by one more photograph ({_called(exposure)})"
 
 
 def _steps(found: "Plan") -> list[tuple[str, list[float | None]]]:
@@ -250,9 +257,16 @@ def _error_rows(found: "Plan") -> list[list[str]]:
 
 
 def _sequence(found: "Plan") -> "Table":
+    from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
-    table = Table(title="Error bars after the best shot, the best after that one, …")
+    table = Table(
+        title="Error bars after the best shot, the best after that one, …",
+        box=SIMPLE_HEAD,
+        padding=(0, 1, 0, 0),
+        show_edge=False,
+        title_justify="left",
+    )
     for number, (name, _) in enumerate([("", []), *_steps(found)]):
         table.add_column(name, justify="right" if number else "left")
     for row in _error_rows(found):
@@ -333,7 +347,7 @@ def _draw_curves(axes: "Axes", ranked: "Sequence[Prospect]", exposure: str) -> N
     axes.axvline(90, color="#888", linewidth=0.8)
     axes.text(90, 1.01, "sunset", transform=axes.get_xaxis_transform(), ha="center", fontsize=8, color="#555")
     axes.set_xlabel("zenith angle of the sun, degrees")
-    axes.set_title(f"error bars shrink by ({_called(exposure)})", fontsize=10, pad=16)
+    axes.set_title(_title(exposure), fontsize=10, pad=16)
     axes.legend(fontsize=8, frameon=False)
     axes.grid(alpha=0.25)
 
@@ -350,10 +364,10 @@ def _draw_steps(axes: "Axes", found: "Plan") -> None:
         axes.plot(positions, percent, marker="o", markersize=4, label=aim)
     axes.set_yscale("log")
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g} %"))
-    labels = ["\n".join(textwrap.wrap(name, 90 // len(positions))) for name, _ in _steps(found)]
+    labels = ["\n".join(textwrap.wrap(name, 96 // len(positions))) for name, _ in _steps(found)]
     axes.set_xticks(positions, labels, fontsize=8)
     axes.set_xlim(-0.3, len(found.sequence) + 0.3)
-    axes.set_title("error bars along the sequence (no point: not determined)", fontsize=10, pad=16)
+    axes.set_title("Error bars along the sequence (no point: not determined)", fontsize=10, pad=16)
     axes.legend(fontsize=8, frameon=False)
     axes.grid(alpha=0.25)
 
@@ -370,7 +384,7 @@ def _draw_gains(axes: "Axes", best: "Sequence[Prospect]", aims: Sequence[str]) -
         axes.text(column, row, _gain(value), ha="center", va="center", fontsize=8, color=colour)
     axes.set_xticks(range(len(aims)), list(aims), fontsize=8)
     axes.set_yticks(range(len(best)), [f"{p.shot.name}   {_gain(p.gain)}" for p in best], fontsize=8)
-    axes.set_title("gain of each parameter by the best shots", fontsize=10)
+    axes.set_title("Gain of each parameter by the best shots", fontsize=10)
     return shown
 
 

@@ -3,8 +3,8 @@
 python tests/benchmarks/planning.py [REALISATIONS]
 
 The design's table was made by a prototype with another number of pixels, so one common factor is taken out before the two are
-compared. The advice is followed as often as there are realisations of the noise: the fits of two simulated skies, alone and
-with the shot recommended, scatter about the truth, and the ratio of their scatter is what the shot was worth.
+compared. The advice is followed as often as there are realisations of the noise: fits of two simulated skies, alone
+and with the shot recommended, say by how much their error bars shrink, and their errors whether those can be believed.
 """
 
 import math
@@ -128,26 +128,30 @@ def followed(console: Console, count: int, exposure: str, aims: tuple[str, ...])
     photo = advice.shot
     assert isinstance(photo, Photo)
 
-    def fitted(photos: list[Photo], seed: int) -> tuple[np.ndarray, np.ndarray]:
-        """Error bars and errors of the numbers of every aim, tied ones once."""
+    def fitted(photos: list[Photo], seed: int) -> tuple[np.ndarray, float]:
+        """Error bars of the numbers of every aim, tied ones once, and the square of their errors in units of these."""
         images = [simulated(photo, 1000 * seed + number, f"photo {number}") for number, photo in enumerate(photos)]
         result = fitting.fit(images, init=TRUTH, free=FREE, tie=TIE, refine=False).with_truth(TRUTH)
-        chosen = [
-            e for aim in aims for e in [e for e in result.parameters if e.field == aim][: 1 if aim in TIE else None]
+        estimates = [
+            estimate
+            for aim in aims
+            for estimate in [e for e in result.parameters if e.field == aim][: 1 if aim in TIE else None]
         ]
-        return np.array([e.standard_error for e in chosen]), np.array([e.value - e.truth for e in chosen])
+        rows = [result.covariance_names.index(estimate.name) for estimate in estimates]
+        bars = np.array([estimate.standard_error for estimate in estimates])
+        pulls = np.array([estimate.pull for estimate in estimates])
+        correlation = result.covariance[np.ix_(rows, rows)] / np.outer(bars, bars)
+        return bars, pulls @ np.linalg.solve(correlation, pulls) / len(pulls)
 
+    runs = [[fitted(photos, seed) for seed in range(count)] for photos in (first, [*first, photo])]
     weight = np.concatenate([[1.0] if aim in TIE or aim in SCALARS else [1 / 3] * 3 for aim in aims]) / len(aims)
-    runs = [
-        [np.stack(column) for column in zip(*(fitted(photos, seed) for seed in range(count)), strict=True)]
-        for photos in (first, [*first, photo])
-    ]
-    bars = math.exp(weight @ np.log(runs[0][0] / runs[1][0]).mean(axis=0))
-    scatter = math.exp(weight @ np.log(np.mean(runs[0][1] ** 2, axis=0) / np.mean(runs[1][1] ** 2, axis=0)) / 2)
+    logs = [np.mean([np.log(bars) for bars, _ in run], axis=0) for run in runs]
+    gain = math.exp(weight @ (logs[0] - logs[1]))
+    sizes = [math.sqrt(np.mean([square for _, square in run])) for run in runs]
     console.print(
         f"for {'all' if aims == FREE else ', '.join(aims)}, exposures {exposure}: {photo.name}; promised {advice.gain:.2f}; "
-        f"{count} fits: error bars {bars:.2f} ({bars / advice.gain:.3f} of it), scatter {scatter:.2f} "
-        f"({scatter / advice.gain:.2f} of it, ± {1 / math.sqrt(count):.0%} for a single number)"
+        f"error bars of {count} fits {gain:.2f}, {gain / advice.gain:.3f} of it; errors over error bars before "
+        f"{sizes[0]:.2f}, after {sizes[1]:.2f} (± {1 / math.sqrt(2 * count * len(weight)):.2f})"
     )
 
 
