@@ -318,7 +318,7 @@ def _factor(value: float, _: object = None) -> str:
 def _figure(found: "Plan", exposure: str) -> "Figure":
     """Gain against the height of the sun; error bars along the sequence; gains by parameter of the best shots."""
     from matplotlib.figure import Figure
-    from matplotlib.ticker import FuncFormatter
+    from matplotlib.ticker import FuncFormatter, MaxNLocator, NullLocator
 
     ranked = [mine for mine, _ in _ranked(found, exposure)]
     figure = Figure(figsize=(15, 10.5), layout="constrained")
@@ -328,22 +328,25 @@ def _figure(found: "Plan", exposure: str) -> "Figure":
     _draw_steps(steps, found)
     gains = below.subplots()
     bar = below.colorbar(_draw_gains(gains, ranked[:SHOWN], found.aims), ax=gains, pad=0.01, shrink=0.9)
+    bar.ax.yaxis.set_major_locator(MaxNLocator(6))
+    bar.ax.yaxis.set_minor_locator(NullLocator())
     bar.ax.yaxis.set_major_formatter(FuncFormatter(_factor))
     bar.ax.tick_params(labelsize=8)
     return figure
 
 
 def _draw_curves(axes: "Axes", ranked: "Sequence[Prospect]", exposure: str) -> None:
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+    from matplotlib.ticker import FuncFormatter, MaxNLocator, NullLocator
 
     kinds = dict.fromkeys(prospect.shot.kind for prospect in ranked)
     for kind in kinds:
         own = sorted((math.degrees(p.shot.sun_zenith), p.gain) for p in ranked if p.shot.kind == kind)
         axes.plot(*zip(*own, strict=True), marker="o", markersize=4, label=kind)
     axes.set_yscale("log")
-    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    # Gains span less than a decade, where a logarithmic axis of its own accord has one number.
+    axes.yaxis.set_major_locator(MaxNLocator(8))
+    axes.yaxis.set_minor_locator(NullLocator())
     axes.yaxis.set_major_formatter(FuncFormatter(_factor))
-    axes.yaxis.set_minor_formatter(NullFormatter())
     axes.axvline(90, color="#888", linewidth=0.8)
     axes.text(90, 1.01, "sunset", transform=axes.get_xaxis_transform(), ha="center", fontsize=8, color="#555")
     axes.set_xlabel("zenith angle of the sun, degrees")
@@ -368,7 +371,7 @@ def _draw_steps(axes: "Axes", found: "Plan") -> None:
     axes.set_xticks(positions, labels, fontsize=8)
     axes.set_xlim(-0.3, len(found.sequence) + 0.3)
     axes.set_title("Error bars along the sequence (no point: not determined)", fontsize=10, pad=16)
-    axes.legend(fontsize=8, frameon=False)
+    axes.legend(fontsize=8, frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0))
     axes.grid(alpha=0.25)
 
 
