@@ -113,6 +113,18 @@ def test_models_take_it(model):
     np.testing.assert_allclose(got, wanted, rtol=2e-3)
 
 
+def test_a_table_that_is_zero_wherever_one_looks_is_no_division_by_zero():
+    """Light goes back within 10° only, between the nodes at which moments sum the peak: its light is spread, not lost."""
+    haze = replace(diffatmo.earth(), mie_scattering=jnp.full(3, 0.13), mie_scale_height=2.2)
+    back = np.asarray(seen(diffatmo.Moments(), replace(haze, mie_phase=PhaseTable([0, 170, 180], [0, 0, 1]))))
+    clear = np.asarray(
+        seen(diffatmo.Moments(), replace(haze, mie_scattering=jnp.zeros(3), mie_absorption=jnp.zeros(3)))
+    )
+    assert np.all(np.isfinite(back))
+    # What the haze takes from the sun's light goes somewhere: the sky is not black.
+    assert np.all(back > 0.3 * clear)
+
+
 def test_the_path_tracer_samples_it():
     """Within the standard errors of both; a table with more peak is another sky."""
     haze = replace(diffatmo.earth(), mie_scattering=jnp.full(3, 0.13), mie_scale_height=2.2, mie_g=G)

@@ -100,7 +100,9 @@ def _peak(mie_phase: phase.Shape) -> Callable[..., Float[Array, "1 ..."]]:
     ) -> Float[Array, "1 f k j"]:
         aerosol = phase.mie(nu, g[0], mie_phase)
         norm = 2 * jnp.pi * jnp.mean(jnp.sum(aerosol * solid_angle[:, None], axis=1), axis=0)
-        return (aerosol / norm)[None]
+        # A table may be zero at all nodes; its light is then spread, not lost.
+        seen = norm > tiny(norm.dtype)
+        return jnp.where(seen, aerosol / jnp.where(seen, norm, 1), 1 / (4 * jnp.pi))[None]
 
     return peak
 
