@@ -81,6 +81,9 @@ def test_molecular_prior_is_the_mass_of_the_air():
 
 def test_ozone_climatology():
     """About 260 DU at the equator, a maximum in spring at high latitudes of either hemisphere (Van Heuklon 1979, fig. 3)."""
+    # The example that comes with the MLML toolbox of Broenkow & Flora (1997): 321.2 DU at 36° N 122° W on day 185.
+    example = priors.ozone(latitude_deg=36.0, longitude_deg=-122.0, day_of_year=185)[0]
+    assert example.value == pytest.approx(321.2, abs=0.05)
     of = lambda latitude, day: priors.ozone(latitude_deg=latitude, longitude_deg=0.0, day_of_year=day)[0].value
     assert of(0.0, 100) == pytest.approx(235)
     assert of(65.0, 90) > 400 > of(65.0, 280)
