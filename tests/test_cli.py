@@ -23,6 +23,7 @@ from diffatmo.cli.scenefile import FREE, read_scene
 from diffatmo.models.base import Model, Sky
 from diffatmo.models.base import Path as RayPath
 from diffatmo.render import Scene
+from fitting import checkpoint, report
 
 ROOT = Path(__file__).parent.parent
 
@@ -247,6 +248,32 @@ def test_fit_of_single_images(tmp_path, s1, start, toy, capfd):
     assert np.allclose(fitted.rayleigh_scattering, s1.rayleigh_scattering, rtol=0.02)
     assert np.array_equal(fitted.mie_scattering, s1.mie_scattering)
     assert "<html" in (out / "report.html").read_text()
+
+
+def test_fit_goes_on_where_it_was_broken_off(tmp_path, s1, start, toy, capfd, monkeypatch):
+    """Broken off while the results are written, the worst of moments: what was found is in the checkpoint."""
+    image, out = toy_image(tmp_path / "sky.exr", s1, zenith=40, seed=1), tmp_path / "out"
+    command = ["fit", image, "--init", start, *TOY_FREE, "-o", str(out)]
+    with monkeypatch.context() as patch:
+        patch.setattr(report, "write", lambda *_, **__: (_ for _ in ()).throw(OSError("No space left on device")))
+        assert main(command) != 0
+    kept = (out / checkpoint.FILE).read_bytes()
+    capfd.readouterr()
+    assert main(command) == 2
+    assert "--resume" in capfd.readouterr().err
+    assert main([*command, "--resume", "--overwrite"]) == 2
+    assert main([*command, "--resume", "--free", "mie_g"]) == 2
+    assert "belongs to a fit of other images or options" in capfd.readouterr().err
+    assert (out / checkpoint.FILE).read_bytes() == kept
+    assert main([*command, "--resume"]) == 0
+    assert "Going on from" in capfd.readouterr().out
+    record = json.loads((out / "fit.json").read_text())
+    # It was at the optimum already: the steps before, one to be there again, and one of the finer model's pass, if any.
+    assert record["converged"]
+    assert not (out / checkpoint.FILE).exists()
+    (out / checkpoint.FILE).write_bytes(kept)
+    assert main([*command, "--overwrite"]) == 0
+    assert "Going on" not in capfd.readouterr().out
 
 
 def test_fit_of_a_scene_file(tmp_path, s1, start, toy):

@@ -274,8 +274,6 @@ def test_nothing_is_replaced_unless_asked(tmp_path):
     with pytest.raises(InputError, match="--resume to go on, or --overwrite"):
         fit(files, out)
     assert (out / "a" / results.RECORD).read_text() == (out / results.FILE).read_text() == "mine"
-    with pytest.raises(InputError, match="contradict"):
-        fit(files, out, resume=True, overwrite=True)
     assert fit(files, out, overwrite=True) == 0
     assert table(out)["a"]["mie_g"] == "1.0"
 

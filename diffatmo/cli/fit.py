@@ -97,6 +97,8 @@ def fit(
         "model": model,
         "max_steps": max_steps,
     }
+    if resume and overwrite:
+        raise InputError("--resume and --overwrite contradict each other: one keeps what is there, one replaces it")
     options = keys.given(IMAGE_KEYS, values)
     if each or any(image.is_dir() for image in images):
         if not images and not config:
@@ -110,11 +112,14 @@ def fit(
     specs = plan(images, config, options, output)
     # All that can be wrong is found before the first fit, which is written as soon as it is done.
     jobs = {directory: prepare(spec.override(**override)) for directory, spec in specs.items()}
-    from fitting import report
+    from fitting import checkpoint, report
 
     begun = {directory: check_begun(directory, resume=resume, overwrite=overwrite) for directory in jobs}
     for directory in jobs:
         report.check_writable(directory, overwrite=overwrite or begun[directory])
+    if overwrite:
+        for directory in jobs:
+            (directory / checkpoint.FILE).unlink(missing_ok=True)
     converged = [run(job, directory, overwrite=overwrite or begun[directory]) for directory, job in jobs.items()]
     return 0 if all(converged) else NOT_CONVERGED
 
@@ -124,15 +129,11 @@ def check_begun(directory: Path, *, resume: bool, overwrite: bool) -> bool:
     from fitting import checkpoint
 
     file = directory / checkpoint.FILE
-    if not file.exists():
-        return False
-    if overwrite:
-        file.unlink()
-    elif not resume:
+    if not (resume or overwrite) and file.exists():
         raise InputError(
             f"{file}: a fit was broken off here; give --resume to go on with it, or --overwrite to begin anew"
         )
-    return not overwrite
+    return resume and file.exists()
 
 
 def plan(images: Sequence[Path], config: Path | None, options: Mapping[str, Any], output: Path) -> dict[Path, FitSpec]:

@@ -119,8 +119,6 @@ def fit_each(
     ``output`` gets a folder for each image and the table. With ``resume`` results that are complete, and made from the same
     image, options and version, stay; others are replaced, as with ``overwrite`` all are.
     """
-    if resume and overwrite:
-        raise InputError("--resume and --overwrite contradict each other: one keeps what is there, one replaces it")
     fitter.prepare(replace(spec, images=()))
     names = folder_names([image.file for image in spec.images])
     tasks = [
