@@ -85,6 +85,8 @@ def spec(*files, **values):
 
 
 def main():
+    # Programs begun in the background of a shell have interrupts ignored, and their children with them.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     output, jobs, *files = sys.argv[1:]
     whole = results.dumps
 

@@ -100,9 +100,11 @@ def _peak(mie_phase: phase.Shape) -> Callable[..., Float[Array, "1 ..."]]:
     ) -> Float[Array, "1 f k j"]:
         aerosol = phase.mie(nu, g[0], mie_phase)
         norm = 2 * jnp.pi * jnp.mean(jnp.sum(aerosol * solid_angle[:, None], axis=1), axis=0)
-        # A table may be zero at all nodes; its light is then spread, not lost.
-        seen = norm > tiny(norm.dtype)
-        return jnp.where(seen, aerosol / jnp.where(seen, norm, 1), 1 / (4 * jnp.pi))[None]
+        if isinstance(mie_phase, phase.PhaseTable):
+            # A formula is positive everywhere, a table may be zero at all nodes; its light is then spread, not lost.
+            seen = norm > tiny(norm.dtype)
+            aerosol, norm = jnp.where(seen, aerosol, 1), jnp.where(seen, norm, 4 * jnp.pi)
+        return (aerosol / norm)[None]
 
     return peak
 
