@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 # Most of the time of the suite goes to the compiler; see diffatmo/compiling.py.
-COMPILE_FAST := --xla_cpu_use_fusion_emitters=false
+COMPILE_FAST := --xla_cpu_use_fusion_emitters=false --xla_cpu_experimental_ynn_fusion_type=
 
 .PHONY: demo test clean
 
@@ -14,7 +14,7 @@ test: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	XLA_FLAGS=$(COMPILE_FAST) $(BIN)/pytest -n 2 --dist worksteal
+	XLA_FLAGS="$(COMPILE_FAST)" $(BIN)/pytest -n 2 --dist worksteal
 
 $(READY): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "diffatmo needs Python 3.11 or newer; say which with: make PYTHON=/path/to/python3")'

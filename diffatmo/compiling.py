@@ -13,15 +13,16 @@ import numpy as np
 P = ParamSpec("P")
 T = TypeVar("T")
 
-_CPU: dict[str, bool | int] = {"xla_cpu_use_fusion_emitters": False}
-"""XLA's older emitters of loops. The newer ones take twice as long to compile programs of many small formulas, as the models
-are, and make them 10 % faster."""
+_CPU: dict[str, bool | int | str] = {"xla_cpu_use_fusion_emitters": False, "xla_cpu_experimental_ynn_fusion_type": ""}
+"""XLA's older emitters of loops: the newer ones take twice as long to compile programs of many small formulas, as the models
+are, and make them 10 % faster. And no library for products and sums: the models' are too small for it to pay its way, and
+without it they run a third faster."""
 
 _CPU_FEW_CALLS = _CPU | {"xla_backend_optimization_level": 1}
 """Another 15 % off the time to compile, for up to half as much again to run."""
 
 
-def _known(options: dict[str, bool | int]) -> dict[str, bool | int]:
+def _known(options: dict[str, bool | int | str]) -> dict[str, bool | int | str]:
     """``options``, or none on a device or with a version of XLA that they are not for."""
     if jax.default_backend() != "cpu":
         return {}
@@ -33,7 +34,7 @@ def _known(options: dict[str, bool | int]) -> dict[str, bool | int]:
 
 
 @lru_cache
-def compiler_options() -> dict[str, bool | int]:
+def compiler_options() -> dict[str, bool | int | str]:
     """Options for :func:`jax.jit` with which the models compile in about half the time; empty where they are unknown.
 
     ``jax.jit(function, compiler_options=diffatmo.compiler_options())``; JAX takes options for the outermost ``jit`` only.
