@@ -32,7 +32,7 @@ SMALL = Moments(
 COMPILE_FAST = {"xla_backend_optimization_level": 0}
 """Everything here is computed once or a few times: what takes long is compilation."""
 
-TABLES = Bruneton(sizes=Sizes(8, 16, 4, 8, 4, 8, 6, 4), steps=Steps(19, 5, 5, 4, 4), orders=3)
+TABLES = Bruneton(sizes=Sizes(8, 16, 4, 8, 4, 8, 6, 4), steps=Steps(19, 5, 5, 4, 4), orders=3, quadrature="gauss")
 """19: with 20, samples of the vertical ray would fall on the very edges of the absorber, where its slope jumps."""
 LUTS = Hillaire((16, 8), (6, 6), (12, 12), hillaire.Steps(19, 5, 5, 5, 3))
 MODELS = {"moments": SMALL, "bruneton": TABLES, "hillaire": LUTS, "raymarch": RayMarch(steps=4)}

@@ -170,7 +170,8 @@ class Planet(eqx.Module):
         falling = -safe_divide(squares, 2 * (radius + altitude) * down, 1.0)
         up = jnp.maximum(nearest + (farthest - nearest) * x, self.top_altitude - altitude)
         horizon = geometry.horizon_mu(altitude, radius)
-        return jnp.concatenate([jnp.clip(falling, -1, horizon), self._mu_up(altitude, up)])
+        # From the ground, rounding would else let the horizontal ray dip below the horizon.
+        return jnp.concatenate([jnp.clip(falling, -1, horizon), jnp.maximum(self._mu_up(altitude, up), horizon)])
 
     def ground_nodes(self) -> Bool[Array, " mu"]:
         """Which of them are for rays that meet the ground."""

@@ -12,7 +12,7 @@ from diffatmo import geometry, phase
 from diffatmo._types import Altitude, Cosine, Irradiance, Length
 from diffatmo.atmosphere import Atmosphere
 from diffatmo.models.base import Model, Path, Sky
-from diffatmo.models.bruneton.precomputation import Steps, Tables, look_up, precompute
+from diffatmo.models.bruneton.precomputation import GAUSS, QUADRATURES, TRAPEZOID, Steps, Tables, look_up, precompute
 from diffatmo.models.tables import PARAMETERISATIONS, Planet, Sizes, bilinear
 from diffatmo.models.transmittance_table import SUN_ANGULAR_RADIUS, between, to_ground, to_sun, to_top
 from diffatmo.numerics import safe_divide
@@ -24,14 +24,21 @@ class Bruneton(Model):
     """The model of Bruneton & Neyret 2008; ``parameterisation`` "2008" or "2017" says where the entries of its tables are.
 
     ``packed`` keeps aerosol's single scattering at one wavelength only, the first, as the paper does with its red channel, and
-    recovers it at the others from the single scattering by air (paper, section 4). Raises :class:`ValueError` for sizes that
-    cannot be.
+    recovers it at the others from the single scattering by air (paper, section 4).
+
+    ``quadrature`` is "trapezoid", the papers' equidistant steps along a ray, or "gauss". The steps are 2 km long towards the
+    zenith, longer than aerosol is high: at a scale height of 1.2 km they make its column 22 % too large (x coth(x), x half a
+    step over the scale height), and that once for each order of scattering. Gauss's rule does it right with a fifth of the
+    nodes.
+
+    Raises :class:`ValueError` for sizes that cannot be.
     """
 
     parameterisation: str = "2017"
     sizes: Sizes = Sizes()
     steps: Steps = Steps()
     orders: int = 4
+    quadrature: str = TRAPEZOID
     mu_s_min: float = -0.2
     """Cosine of the lowest sun that the tables of 2017 know."""
     sun_angular_radius: float = SUN_ANGULAR_RADIUS
@@ -41,6 +48,9 @@ class Bruneton(Model):
         if self.parameterisation not in PARAMETERISATIONS:
             known = " or ".join(repr(name) for name in PARAMETERISATIONS)
             raise ValueError(f"parameterisation: got {self.parameterisation!r}, expected {known}")
+        if self.quadrature not in QUADRATURES:
+            known = " or ".join(repr(name) for name in QUADRATURES)
+            raise ValueError(f"quadrature: got {self.quadrature!r}, expected {known}")
         for name, count in self.sizes._asdict().items():
             least = 4 if name == "mu" else 2
             if count < least or (name == "mu" and count % 2):
@@ -55,7 +65,7 @@ class Bruneton(Model):
     @classmethod
     def reduced(cls) -> "Bruneton":
         """Smaller tables and fewer steps, for fits."""
-        return cls(sizes=Sizes(32, 128, 8, 32, 16, 64, 24, 8), steps=Steps(64, 20, 20, 8, 16))
+        return cls(sizes=Sizes(32, 128, 8, 32, 16, 64, 24, 8), steps=Steps(64, 12, 12, 8, 16), quadrature=GAUSS)
 
     def planet(self, atmosphere: Atmosphere) -> Planet:
         """The coordinates of the tables."""
@@ -66,8 +76,9 @@ class Bruneton(Model):
         """Precompute the tables."""
         planet = self.planet(atmosphere)
         tables = precompute(
-            atmosphere, planet, orders=self.orders, steps=self.steps, sun_angular_radius=self.sun_angular_radius
-        )
+            atmosphere, planet, orders=self.orders, steps=self.steps, quadrature=self.quadrature,
+            sun_angular_radius=self.sun_angular_radius,
+        )  # fmt: skip
         return BrunetonSky(atmosphere, planet, tables, self.sun_angular_radius, self.packed)
 
 

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from diffatmo import geometry, phase, table
+from diffatmo import geometry, phase, rays, table
 from diffatmo._types import Altitude, Cosine, Irradiance, Length, Scalar
 from diffatmo.atmosphere import Atmosphere
 from diffatmo.models.tables import Planet, bilinear, possible, taps
@@ -27,6 +27,10 @@ from diffatmo.models.transmittance_table import between, compute_transmittance, 
 from diffatmo.numerics import safe_divide
 
 Scattered = Float[Array, "r m v s w"]
+
+
+TRAPEZOID, GAUSS = QUADRATURES = ("trapezoid", "gauss")
+"""Along a ray: the papers' equidistant steps, or the nodes of :mod:`diffatmo.rays`, which lie where the densities change."""
 
 
 class Steps(NamedTuple):
@@ -85,6 +89,18 @@ def _axes(planet: Planet, altitude: Scalar) -> _Axes:
     return _Axes(altitude, mu, ground, mu_s, nu, length)
 
 
+def _quadrature(planet: Planet, axes: _Axes, steps: int, rule: str) -> tuple[Float[Array, "n m"], Float[Array, "n m"]]:
+    """Distances along the rays and their weights, km."""
+    if rule == TRAPEZOID:
+        i = jnp.arange(steps + 1)
+        return axes.length * (i / steps)[:, None], axes.length * trapezoid(i, steps)[:, None]
+    start = jnp.broadcast_to(axes.altitude, axes.mu.shape)
+    nodes = rays.trace(
+        start, axes.mu, axes.ground, planet.bottom_radius, planet.top_altitude, max(steps // rays.PIECES, 1)
+    )
+    return nodes.distance.T, nodes.weight.T
+
+
 def _along(planet: Planet, axes: _Axes, distance: Float[Array, " m"]) -> tuple[Altitude, Cosine, Float[Array, "m v s"]]:
     """Altitude, mu and mu_s at a distance along the rays."""
     there = planet.altitude_after(axes.altitude, axes.mu, distance)
@@ -99,6 +115,7 @@ def compute_single_scattering(
     transmittance: Float[Array, "r mu w"],
     sun_angular_radius: float,
     steps: int,
+    quadrature: str,
 ) -> tuple[Scattered, Scattered]:
     """ΔS_R and ΔS_M of order 1, without phase functions (paper, eq. 7)."""
 
@@ -107,21 +124,21 @@ def compute_single_scattering(
         axes = _axes(planet, altitude)
         start = jnp.broadcast_to(altitude, axes.mu.shape)
 
-        def step(sums: tuple[Array, Array], i: Array) -> tuple[tuple[Array, Array], None]:
-            distance = axes.length * (i / steps)
+        def step(sums: tuple[Array, Array], node: tuple[Length, Length]) -> tuple[tuple[Array, Array], None]:
+            distance, length = node
             there, _, mu_s = _along(planet, axes, distance)
             view = between(planet, transmittance, start, axes.mu, distance, axes.ground)
             # All suns of a ray share the row of the table at this altitude.
             suns = mu_s.reshape(mu_s.shape[0], -1)
             sun = to_sun(planet, transmittance, there[:, None], suns, sun_angular_radius)
             sun = sun.reshape(*mu_s.shape, -1)
-            weight = (trapezoid(i, steps) * axes.length)[:, None] * view
+            weight = length[:, None] * view
             air = weight * atmosphere.rayleigh_density(there)[:, None]
             aerosol = weight * atmosphere.mie_density(there)[:, None]
             return (sums[0] + air[:, None, None] * sun, sums[1] + aerosol[:, None, None] * sun), None
 
         zero = jnp.zeros((*axes.nu.shape, transmittance.shape[-1]), axes.nu.dtype)
-        return jax.lax.scan(step, (zero, zero), jnp.arange(steps + 1))[0]
+        return jax.lax.scan(step, (zero, zero), _quadrature(planet, axes, steps, quadrature))[0]
 
     rayleigh, mie = jax.lax.map(at, planet.altitudes())
     light = atmosphere.solar_irradiance
@@ -247,7 +264,7 @@ def compute_indirect_irradiance(planet: Planet, incident: Incident, count: int) 
 
 
 def compute_multiple_scattering(
-    planet: Planet, transmittance: Float[Array, "r mu w"], density: Scattered, steps: int
+    planet: Planet, transmittance: Float[Array, "r mu w"], density: Scattered, steps: int, quadrature: str
 ) -> Scattered:
     """ΔS: what ΔJ sends towards a point along every ray (paper, eq. 11)."""
     sizes = planet.sizes
@@ -260,16 +277,15 @@ def compute_multiple_scattering(
         ray = jnp.arange(sizes.mu)[:, None, None]
         first_nu, part_nu = taps(planet.nu_position(axes.nu), sizes.nu)
 
-        def step(total: Array, i: Array) -> tuple[Array, None]:
-            distance = axes.length * (i / steps)
+        def step(total: Array, node: tuple[Length, Length]) -> tuple[Array, None]:
+            distance, length = node
             there, mu, mu_s = _along(planet, axes, distance)
             # First along r and mu, which are common to all suns, then along nu and mu_s.
             (ir, fr), (im, fm) = (
                 taps(planet.altitude_position(there), sizes.r),
                 taps(planet.mu_position(there, mu, axes.ground), sizes.mu),
             )
-            weight = (trapezoid(i, steps) * axes.length)[:, None]
-            view = between(planet, transmittance, start, axes.mu, distance, axes.ground) * weight
+            view = between(planet, transmittance, start, axes.mu, distance, axes.ground) * length[:, None]
             corners = ((0, 0, (1 - fr) * (1 - fm)), (0, 1, (1 - fr) * fm), (1, 0, fr * (1 - fm)), (1, 1, fr * fm))
             rows = sum(part[:, None, None] * by_ray[(ir + a) * sizes.mu + im + b] for a, b, part in corners)
             rows = rows * view[:, None]
@@ -282,25 +298,27 @@ def compute_multiple_scattering(
             return total + light, None
 
         zero = jnp.zeros((*axes.nu.shape, density.shape[-1]), axes.nu.dtype)
-        return jax.lax.scan(step, zero, jnp.arange(steps + 1))[0]
+        return jax.lax.scan(step, zero, _quadrature(planet, axes, steps, quadrature))[0]
 
     return jax.lax.map(at, planet.altitudes())
 
 
 def precompute(
-    atmosphere: Atmosphere, planet: Planet, *, orders: int, steps: Steps, sun_angular_radius: float
+    atmosphere: Atmosphere, planet: Planet, *, orders: int, steps: Steps, quadrature: str, sun_angular_radius: float
 ) -> Tables:
     """All tables, by the paper's algorithm 4.1 with ``orders`` orders of scattering."""
     transmittance = compute_transmittance(atmosphere, planet, steps.transmittance)
     delta_e = compute_direct_irradiance(atmosphere, planet, transmittance, sun_angular_radius)
-    rayleigh, mie = compute_single_scattering(atmosphere, planet, transmittance, sun_angular_radius, steps.single)
+    rayleigh, mie = compute_single_scattering(
+        atmosphere, planet, transmittance, sun_angular_radius, steps.single, quadrature
+    )
     irradiance, total = jnp.zeros_like(delta_e), rayleigh
     toward = jax.vmap(lambda altitude: phase.rayleigh(_axes(planet, altitude).nu))(planet.altitudes())[..., None]
 
     def order(incident: Incident, delta_e: Irradiance) -> tuple[Scattered, Irradiance]:
         density = compute_scattering_density(atmosphere, planet, transmittance, delta_e, incident, steps.density)
         falling = compute_indirect_irradiance(planet, incident, steps.irradiance)
-        return compute_multiple_scattering(planet, transmittance, density, steps.multiple), falling
+        return compute_multiple_scattering(planet, transmittance, density, steps.multiple, quadrature), falling
 
     if orders > 1:
         delta_s, delta_e = order(of_first_order(atmosphere, planet, rayleigh, mie), delta_e)
