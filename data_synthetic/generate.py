@@ -93,9 +93,11 @@ def towards(zenith_deg: float) -> Direction:
     return sun.direction(zenith=jnp.radians(zenith_deg), azimuth=jnp.radians(30.0))
 
 
-def trace(truth: atmosphere.Atmosphere, zenith_deg: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
+def trace(
+    truth: atmosphere.Atmosphere, zenith_deg: float, seed: int, samples: int = SAMPLES
+) -> tuple[np.ndarray, np.ndarray]:
     """Mean and standard error of a picture, without the noise of a sensor."""
-    sky = PathTrace(samples=SAMPLES, seed=seed).sky(truth)
+    sky = PathTrace(samples=samples, seed=seed).sky(truth)
     mean, error, _ = sky.radiance_with_error(
         altitude=jnp.asarray(ALTITUDE_KM), view=camera().directions(), sun=towards(zenith_deg)
     )
