@@ -2,10 +2,11 @@
 
 python tests/benchmarks/calibration.py [REALISATIONS] [NAME ...]
 
-The Monte Carlo means are traced anew, a quarter of an hour for a sky, and kept in a folder of the system's temporary files. Their
-own noise is a few tenths of the sensor's where the sky is bright. Realisations have to share it, so each takes every channel
-from another mean: the channels of one mean come from the same paths, and their errors are alike, which no fit expects. And the
-errors of a mean's pixels are taken from the *other* means, as an estimate from a pixel's own paths is large where the value is.
+The Monte Carlo means are traced anew, a quarter of an hour for a sky, and kept in a folder of the system's temporary files.
+Their own noise is a few tenths of the sensor's where the sky is bright. Realisations have to share it, so each takes every
+channel from another mean: the channels of one mean come from the same paths, and their errors are alike, which no fit expects.
+And the errors of a mean's pixels are taken from the *other* means, as an estimate from a pixel's own paths is large where the
+value is.
 """
 
 import itertools
