@@ -112,6 +112,18 @@ def test_the_volume_is_the_march_cut_short():
         np.testing.assert_allclose(got.transmittance, wanted.transmittance, atol=0.01)
 
 
+def test_the_volume_from_space_is_empty_up_to_the_atmosphere():
+    """From 1000 km, looking half down: nothing within 900 km above the top, and the planet's light behind it."""
+    camera = diffatmo.Pinhole(5, 5, pitch=-np.pi / 3, fov_y=0.2)
+    sky, sun = solved(Hillaire(), earth()), directions(60.0, 30.0)
+    volume = eqx.filter_jit(lambda s: s.aerial_volume(camera, altitude=1000.0, sun=sun, reach=1280.0))(sky)
+    middle = jnp.full(2, 2.0)
+    got = volume.at(middle, middle, jnp.array([900.0, 1280.0]))
+    np.testing.assert_array_equal(got.inscatter[0], 0)
+    np.testing.assert_array_equal(got.transmittance[0], 1)
+    assert float(got.inscatter[1].min()) > 1e-3 * float(earth().solar_irradiance.min())
+
+
 def test_the_mean_survival_of_a_step():
     """(1 - e^-x) / x on both sides of the switch to its series, and its derivative."""
     x = jnp.array([0.0, 1e-3, 0.00999, 0.0101, 1.0, 50.0])

@@ -111,11 +111,14 @@ class HillaireSky(Sky):
         y = jnp.linspace(-0.5, camera.height - 0.5, height)
         view = camera.directions_at(x, y[:, None])
         mu, mu_s, nu = view[..., 2], sun[2], view @ sun
-        start = jnp.full(mu.shape, altitude, mu.dtype)
         radius, top = self.planet.bottom_radius, self.planet.top_altitude
+        # From space, the slices in front of the atmosphere are empty.
+        start, mu, mu_s, moved, _ = geometry.enter_atmosphere(
+            jnp.full(mu.shape, altitude, mu.dtype), mu, jnp.broadcast_to(mu_s, mu.shape), nu, radius, top
+        )
         ground = geometry.hits_ground(start, mu, radius)
         limit = geometry.distance_to_boundary(start, mu, ground, radius, top)
-        ends = jnp.minimum((jnp.arange(1, slices + 1) * (reach / slices))[:, None, None], limit)
+        ends = jnp.clip((jnp.arange(1, slices + 1) * (reach / slices))[:, None, None] - moved, 0, limit)
         sums = march(
             self.atmosphere,
             self.planet,
