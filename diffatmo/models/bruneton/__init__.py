@@ -65,7 +65,7 @@ class Bruneton(Model):
     @classmethod
     def reduced(cls) -> "Bruneton":
         """Smaller tables and fewer steps, for fits."""
-        return cls(sizes=Sizes(32, 128, 8, 32, 16, 64, 24, 8), steps=Steps(64, 12, 12, 8, 16), quadrature=GAUSS)
+        return cls(sizes=Sizes(32, 128, 8, 32, 16, 64, 24, 8), steps=Steps(64, 10, 10, 16, 16), quadrature=GAUSS)
 
     def planet(self, atmosphere: Atmosphere) -> Planet:
         """The coordinates of the tables."""
