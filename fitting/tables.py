@@ -79,7 +79,7 @@ def _row(estimate: Estimate, *, first: bool) -> _Row:
 
 def _rows(result: Findings) -> list[tuple[_Row, Estimate, bool]]:
     """All rows of the table, with what they show, and whether a rule goes above (a new kind of number begins)."""
-    groups = [[e for e in result.parameters if e.derived == derived] for derived in (False, True)] + [result.exposures]
+    groups = [[e for e in result.parameters if e.derived == derived] for derived in (False, True)] + [result.nuisances]
     rows = []
     for number, group in enumerate(groups):
         before = None
@@ -181,7 +181,7 @@ def fragment(result: Findings) -> str:
 
 
 def to_rows(result: Findings) -> list[dict[str, Any]]:
-    """One row for each number, with None for what is not known; ``kind`` is ``fitted``, ``derived`` or ``exposure``."""
+    """One row for each number, with None for what is not known; ``kind`` is ``fitted``, ``derived`` or ``nuisance``."""
     kinds = [("derived" if e.derived else "fitted", e) for e in result.parameters]
     return [
         {
@@ -198,7 +198,7 @@ def to_rows(result: Findings) -> list[dict[str, Any]]:
             "pull": estimate.pull,
             "at_bound": estimate.at_bound,
         }
-        for kind, estimate in [*kinds, *(("exposure", e) for e in result.exposures)]
+        for kind, estimate in [*kinds, *(("nuisance", e) for e in result.nuisances)]
     ]
 
 
