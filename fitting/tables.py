@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
@@ -138,9 +139,14 @@ def notes(result: Findings) -> list[str]:
         found.append(f"Known beforehand: {known}. The column 'by images' says how much of each precision is their own.")
     if sum(result.outliers):
         found.append(f"{sum(result.outliers)} pixels count for less than half, as outliers.")
+    # Combinations are products of powers, which offsets and pedestals, of either sign, have no part in.
+    signed = {e.name for e in result.nuisances if e.unit == "deg" or e.name.startswith("pedestal_")}
+    kept = np.array([n for n, name in enumerate(result.covariance_names) if name not in signed], dtype=int)
     if said := [
         combination.text
-        for combination in combinations(result.covariance, [result.estimate(name) for name in result.covariance_names])
+        for combination in combinations(
+            result.covariance[np.ix_(kept, kept)], [result.estimate(result.covariance_names[number]) for number in kept]
+        )
     ]:
         found.append(f"Better known together than alone: {'; '.join(said[:6])}.")
     return found
