@@ -144,32 +144,33 @@ def problem(images, model, free=("mie_g",)):
     return Problem(model, parameters, batch, weight, planet_shell(model, parameters))
 
 
-@pytest.mark.parametrize("zenith", [0.0, 40.0])
-@pytest.mark.parametrize(("model", "block"), [(Toy(), 1), (Toy(), 4), (RayMarch(steps=4), 1)])
-def test_jacobian_against_differences(x64, model, zenith, block):
-    """Also with the sun at the zenith, and at no rotation, where angles have no derivative."""
-    lenses = (Fisheye(8, 8), Pinhole(6, 8, fov_y=1.0, pitch=0.9), Equirectangular(6, 24, upper=True))
+LENSES = (Fisheye(8, 8), Pinhole(6, 8, fov_y=1.0, pitch=0.9), Equirectangular(6, 24, upper=True))
+
+
+@pytest.mark.parametrize(
+    ("model", "zenith", "parts", "lenses"),
+    [(Toy(), 0.0, 1, LENSES), (Toy(), 40.0, 4, LENSES), (RayMarch(steps=3), 0.0, 1, LENSES[:1])],
+)
+def test_jacobian_against_differences(x64, model, zenith, parts, lenses):
+    """Also with the sun at the zenith, and at no rotation, where angles have no derivative; and of averaged pixels."""
     choices = {"pedestal": "lens-per-channel", "sun_offset": "free", "pose": "free", "exposure": "free"}
-    images = [
-        photo(lens, toy_sky.towards_sun(zenith), name=f"i{n}", max_pixels=400 if block == 1 else 16, **choices)
-        for n, lens in enumerate(lenses)
-    ]
-    images = with_free(images, focal=("free", "free", "fixed"))
+    size = 400 if parts == 1 else 16
+    images = [photo(lens, toy_sky.towards_sun(zenith), name=f"i{n}", max_pixels=size) for n, lens in enumerate(lenses)]
+    images = with_free(images, focal=("free", "free", "fixed"), **choices)
     ours = problem(images, model)
-    assert ours.batch.directions.shape[2] == block
-    size = 1 + 3 * 5 + 2 + 3 + 3
+    assert ours.batch.directions.shape[2] == parts
+    fast = {"compiler_options": {"xla_backend_optimization_level": 0}}
+    plain = eqx.filter_jit(residuals, **fast)
+    coloured = eqx.filter_jit(lambda y, ours: jacobian(y, linearise(ours.split(y)[0], ours), ours), **fast)
+    rest = jnp.zeros(ours.batch.nuisances.size)
     # With nothing moved, and with everything.
-    for y in (jnp.zeros(size).at[0].set(ours.start[0]), ours.start[0] + 0.1 * jnp.sin(jnp.arange(1.0, size + 1))):
-
-        @eqx.filter_jit
-        def numbers(y, ours):
-            shifts = 1e-6 * jnp.eye(y.size)
-            around = jax.lax.map(lambda shift: residuals(y + shift, ours), jnp.concatenate([shifts, -shifts]))
-            residual, slope = jacobian(y, linearise(ours.split(y)[0], ours), ours)
-            return residual, residuals(y, ours), slope, (around[: y.size] - around[y.size :]).T / 2e-6
-
-        residual, again, slope, numeric = map(np.asarray, numbers(y, ours))
-        np.testing.assert_allclose(residual, again, rtol=1e-9, atol=1e-9)
+    for y in (
+        jnp.concatenate([ours.start[:1], rest + n * 0.1 * jnp.sin(jnp.arange(1.0, rest.size + 1))]) for n in (0, 1)
+    ):
+        residual, slope = map(np.asarray, coloured(y, ours))
+        np.testing.assert_allclose(residual, plain(y, ours), rtol=1e-9, atol=1e-9)
+        steps = 1e-6 * jnp.eye(y.size)
+        numeric = np.stack([plain(y + step, ours) - plain(y - step, ours) for step in steps], axis=-1) / 2e-6
         scale = np.abs(numeric).max(0)
         assert np.all(scale > 0)
         np.testing.assert_allclose(slope / scale, numeric / scale, atol=1e-5)
