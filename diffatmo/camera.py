@@ -10,6 +10,7 @@ differentiated.
 
 from abc import abstractmethod
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -59,6 +60,10 @@ class Camera(eqx.Module):
     @abstractmethod
     def pixel_angle(self) -> float | Scalar:
         """Angle, rad, from one row to the next at the centre of the picture."""
+
+    @abstractmethod
+    def zoomed(self, factor: float | Scalar) -> "Camera":
+        """The same camera with a focal length ``factor`` times as long; raises :class:`CameraError` if it has none."""
 
     @property
     def wraps(self) -> bool:
@@ -138,6 +143,10 @@ class Equirectangular(Camera):
         """Angle, rad, from one row to the next."""
         return (np.pi / 2 if self.upper else np.pi) / self.height
 
+    def zoomed(self, factor: float | Scalar) -> "Equirectangular":
+        """See :class:`Camera`."""
+        raise CameraError("an equirectangular picture has no focal length, expected a fisheye's or a pinhole camera's")
+
     @property
     def wraps(self) -> bool:
         """True: the picture is a full turn."""
@@ -189,6 +198,10 @@ class Fisheye(Camera):
         """Angle, rad, between neighbouring pixels along a radius."""
         return self.fov / min(self.height, self.width)
 
+    def zoomed(self, factor: float | Scalar) -> "Fisheye":
+        """See :class:`Camera`."""
+        return replace(self, fov=self.fov / factor)
+
     def _centred(
         self, x: Float[Array, "..."], y: Float[Array, "..."]
     ) -> tuple[Float[Array, "..."], Float[Array, "..."], Float[Array, "..."]]:
@@ -234,6 +247,10 @@ class Pinhole(Camera):
     def pixel_angle(self) -> Scalar:
         """Angle, rad, between neighbouring pixels at the centre (their distance on a screen at distance 1)."""
         return jnp.tan(self.fov_y / 2) * (2 / self.height)
+
+    def zoomed(self, factor: float | Scalar) -> "Pinhole":
+        """See :class:`Camera`."""
+        return replace(self, fov_y=2 * jnp.arctan(jnp.tan(self.fov_y / 2) / factor))
 
     def _plane(self, x: Float[Array, "..."], y: Float[Array, "..."]) -> Float[Array, "... 3"]:
         right = (x - (self.width - 1) / 2) * self.pixel_angle

@@ -13,6 +13,7 @@ from jaxtyping import Float
 from diffatmo.atmosphere import Atmosphere
 from diffatmo.models import Model
 from fitting._errors import FitError
+from fitting.nuisances import channel_names
 from fitting.observation import Observation, sigma
 from fitting.priors import Prior
 from fitting.quantities import numbers
@@ -60,7 +61,7 @@ class Findings:
 
     atmosphere: Atmosphere
     parameters: list[Estimate]
-    exposures: list[Estimate]
+    nuisances: list[Estimate]
     covariance: Float[np.ndarray, "q q"]
     covariance_names: list[str]
     chi2: float
@@ -109,18 +110,25 @@ class Findings:
     @property
     def whitened(self) -> list[Float[np.ndarray, "height width w"]]:
         """(measured - fitted) / sigma of each image, NaN where a pixel was not used."""
-        return [
-            np.where(o.used[..., None], (o.image - image) / np.asarray(sigma(o, image)), np.nan).astype(np.float32)
-            for o, image in zip(self.observations, self.fitted, strict=True)
-        ]
+        result = []
+        for observation, image in zip(self.observations, self.fitted, strict=True):
+            noise = np.asarray(sigma(observation, image - self.pedestal(observation)))
+            off = (observation.image - image) / noise
+            result.append(np.where(observation.used[..., None], off, np.nan).astype(np.float32))
+        return result
+
+    def pedestal(self, observation: Observation) -> Float[np.ndarray, " w"]:
+        """What was added to the light of an image that was fitted, for each channel."""
+        names = channel_names(observation, "pedestal", [float(nm) for nm in self.atmosphere.wavelengths])
+        return np.array([0.0 if name is None else self.estimate(name).value for name in names])
 
     @property
     def estimates(self) -> list[Estimate]:
-        """Parameters, derived quantities and exposures, in the order of the covariance."""
-        return [*self.parameters, *self.exposures]
+        """Parameters, derived quantities and nuisances, in the order of the covariance."""
+        return [*self.parameters, *self.nuisances]
 
     def estimate(self, name: str) -> Estimate:
-        """The parameter, derived quantity or exposure called ``name``."""
+        """The parameter, derived quantity or nuisance called ``name``."""
         for estimate in self.estimates:
             if estimate.name == name:
                 return estimate

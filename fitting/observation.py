@@ -1,6 +1,6 @@
-"""One photographed sky: an image with its camera, place, sun, noise, mask and exposure, ready to be fitted.
+"""One photographed sky: an image with its camera, place, sun, noise, mask and nuisances, ready to be fitted.
 
-:func:`observe` checks and prepares a single image, :func:`stack` puts several into arrays of one shape.
+:func:`observe` checks and prepares a single image; :mod:`fitting.batch` puts several into arrays of one shape.
 
 *Noise.* A pixel of signal S (in the image's own units) has the variance ``(noise S)² + shot S + floor²``. Where S
 comes from is the business of :mod:`fitting.solve`; taking the noisy pixel itself would weight low outliers more than
@@ -14,15 +14,14 @@ horizon only.
 
 import math
 from collections import Counter
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
-from diffatmo.camera import Camera
+from diffatmo.camera import Camera, CameraError
 from fitting._errors import FitError
 
 FIXED = "fixed"
@@ -33,6 +32,10 @@ NOISE = 0.01
 MAX_PIXELS = 20_000
 SUN_EXCLUSION = math.radians(2.0)
 
+SUN_OFFSET_ERROR = math.radians(0.5)
+POSE_ERROR = math.radians(2.0)
+FOCAL_ERROR = 0.05
+
 
 class Observation(eqx.Module):
     """An image to be fitted, on its (possibly coarser) pixel grid; made by :func:`observe`."""
@@ -40,6 +43,13 @@ class Observation(eqx.Module):
     name: str = eqx.field(static=True)
     exposure: str = eqx.field(static=True)
     white_balance: str = eqx.field(static=True)
+    pedestal: str = eqx.field(static=True)
+    sun_offset: str = eqx.field(static=True)
+    pose: str = eqx.field(static=True)
+    focal: str = eqx.field(static=True)
+    sun_offset_error: float
+    pose_error: float
+    focal_error: float
     exposure_value: float
     altitude: float
     sun: Float[np.ndarray, "3"]
@@ -73,6 +83,13 @@ def observe(
     horizon_exclusion: float = 0.0,
     exposure: str = FIXED,
     white_balance: str = FIXED,
+    pedestal: str = FIXED,
+    sun_offset: str = FIXED,
+    pose: str = FIXED,
+    focal: str = FIXED,
+    sun_offset_error: float = SUN_OFFSET_ERROR,
+    pose_error: float = POSE_ERROR,
+    focal_error: float = FOCAL_ERROR,
     exposure_value: float = 1.0,
     max_pixels: int = MAX_PIXELS,
     name: str = "image",
@@ -96,6 +113,20 @@ def observe(
             one factor; with ``-per-channel`` appended (``"free-per-channel"``) there is one for each channel.
         white_balance: ``"fixed"``, ``"free"``, or the name of a group of images that share one: a factor for each channel but
             the middle one by wavelength, besides the exposure.
+        pedestal: What is added to the light, in units of the image, as a black level that was not subtracted is: ``"fixed"`` at
+            0, ``"free"`` (one number for this image), or the name of a group of images that share one; with ``-per-channel``
+            appended there is one for each channel. With a free one, negative pixels are used.
+        sun_offset: Whether the sun may be elsewhere than ``sun`` says: ``"fixed"``, ``"free"``, or the name of a group of
+            images that share two small angles: the growth of the sun's zenith angle, and the way along its
+            horizon circle, clockwise.
+        pose: Whether the camera may be turned: ``"fixed"``, ``"free"``, or the name of a group of images that share one
+            rotation, a vector in the local frame (east, north, up). Pixels that may cross the horizon, or come from behind
+            what hides them, must be left out: the edge has no derivative.
+        focal: Whether the focal length may differ from the camera's, by a factor: ``"fixed"``, ``"free"``, or the name of a
+            group. Not for equirectangular pictures, which have none.
+        sun_offset_error: Standard deviation of each of the sun's two angles before the image is looked at, rad.
+        pose_error: The same of each component of the rotation, rad.
+        focal_error: The same of the logarithm of the focal length.
         exposure_value: The exposure as far as it is known: pixels = exposure_value × free factor × radiance.
         max_pixels: Average blocks of pixels until no more than this many are used. The model is averaged over four
             directions in each block.
@@ -128,9 +159,22 @@ def observe(
     )
     refuse.unless(saturation is None or saturation > 0, "saturation", saturation, "a number > 0")
     refuse.unless(max_pixels >= 1, "max_pixels", max_pixels, "at least 1")
-    refuse.unless(bool(exposure.removesuffix(PER_CHANNEL)), "exposure", repr(exposure), '"fixed", "free" or a name')
-    refuse.unless(exposure != FIXED + PER_CHANNEL, "exposure", repr(exposure), '"fixed", "free" or a name')
-    refuse.unless(bool(white_balance), "white_balance", repr(white_balance), '"fixed", "free" or a name')
+    for key, value in (("exposure", exposure), ("pedestal", pedestal)):
+        named = value.removesuffix(PER_CHANNEL) and value != FIXED + PER_CHANNEL
+        refuse.unless(bool(named), key, repr(value), '"fixed", "free" or a name')
+    for key, value in (("white_balance", white_balance), ("sun_offset", sun_offset), ("pose", pose), ("focal", focal)):
+        refuse.unless(bool(value), key, repr(value), '"fixed", "free" or a name')
+    for key, error in (
+        ("sun_offset_error", sun_offset_error),
+        ("pose_error", pose_error),
+        ("focal_error", focal_error),
+    ):
+        refuse.unless(0 < error <= 1, key, error, "more than 0 and at most 1" + " rad" * (key != "focal_error"))
+    if focal != FIXED:
+        try:
+            camera.zoomed(1.0)
+        except CameraError as error:
+            refuse(f"focal: {error}")
     if exposure.endswith(PER_CHANNEL) and white_balance != FIXED:
         refuse(f"exposure: {exposure!r} has a factor for each channel already, expected white_balance fixed beside it")
 
@@ -144,7 +188,7 @@ def observe(
         ("outside the camera's field of view", ~inside),
         ("beyond the largest view zenith angle", ~shown),
         ("not finite", ~finite),
-        ("negative", np.any(image < 0, axis=-1)),
+        ("negative", np.any(image < 0, axis=-1) & (pedestal == FIXED)),
         ("black", np.all(image == 0, axis=-1)),
     ]
     if saturation is not None:
@@ -182,6 +226,13 @@ def observe(
         name=name,
         exposure=exposure,
         white_balance=white_balance,
+        pedestal=pedestal,
+        sun_offset=sun_offset,
+        pose=pose,
+        focal=focal,
+        sun_offset_error=float(sun_offset_error),
+        pose_error=float(pose_error),
+        focal_error=float(focal_error),
         exposure_value=float(exposure_value),
         altitude=float(altitude),
         sun=toward_sun / np.linalg.norm(toward_sun),
@@ -263,128 +314,26 @@ def _bin(fields: dict[str, np.ndarray], block: int) -> dict[str, np.ndarray]:
     return {key: value.astype(np.float32) for key, value in binned.items()} | {"used": used, "shown": shown}
 
 
-def sigma(of: "Observation | Batch", expected: Float[Array, "*pixels w"] | np.ndarray) -> Float[Array, "*pixels w"]:
-    """Standard deviation of pixels with the signal ``expected``."""
-    positive = jnp.maximum(expected, 0)
+class Noisy(Protocol):
+    """What has a noise: an observation, or a batch of them."""
+
+    @property
+    def noise(self) -> Any:
+        """Relative standard deviation."""
+
+    @property
+    def noise_shot(self) -> Any:
+        """Variance per unit of signal."""
+
+    @property
+    def noise_floor(self) -> Any:
+        """Standard deviation without signal."""
+
+
+def sigma(of: Noisy, light: Float[Array, "*pixels w"] | np.ndarray) -> Float[Array, "*pixels w"]:
+    """Standard deviation of pixels with the signal ``light``, which a pedestal is not part of."""
+    positive = jnp.maximum(light, 0)
     return jnp.sqrt((of.noise * positive) ** 2 + of.noise_shot * positive + of.noise_floor**2)
-
-
-class Batch(eqx.Module):
-    """Several observations in arrays of one shape; ``pixel`` runs over those shown, padded with unused ones."""
-
-    altitude: Float[Array, " image"]
-    sun: Float[Array, "image 3"]
-    directions: Float[Array, "image pixel part 3"]
-    """One direction for each pixel, or four that have the mean and the variance of those it is the mean of."""
-    measured: Float[Array, "image pixel w"]
-    used: Bool[Array, "image pixel"]
-    noise: Float[Array, "image pixel w"]
-    noise_shot: Float[Array, "image pixel w"]
-    noise_floor: Float[Array, "image pixel w"]
-    exposure_value: Float[Array, " image"]
-    exposure_index: Int[Array, "image w 2"]
-    """Numbers of the free factors of exposure and of white balance."""
-    exposure_count: int = eqx.field(static=True)
-
-    def exposure(self, log_factors: Float[Array, " e"]) -> Float[Array, "image 1 w"]:
-        """What radiance is multiplied by, from the logarithms of the free factors."""
-        logs = jnp.concatenate([log_factors, jnp.zeros(1, log_factors.dtype)])
-        return (self.exposure_value[:, None] * jnp.exp(jnp.sum(logs[self.exposure_index], axis=-1)))[:, None]
-
-
-def exposure_name(observation: Observation) -> str | None:
-    """Name of the image's free exposure factor, or None if the exposure is fixed."""
-    if observation.exposure == FIXED:
-        return None
-    group = observation.exposure.removesuffix(PER_CHANNEL)
-    return f"exposure_{observation.name if group == FREE else group}"
-
-
-def exposures(
-    observations: Sequence[Observation], wavelengths: Sequence[float]
-) -> tuple[list[str], Int[np.ndarray, "image w 2"]]:
-    """Names of the free factors, and for each image and channel the numbers of those of its exposure and of its white balance.
-
-    -1 stands for a fixed one.
-    """
-    _check_groups(observations, [o.exposure.removesuffix(PER_CHANNEL) for o in observations])
-    _check_groups(observations, [o.white_balance for o in observations])
-    factors: dict[str, int] = {}
-    index = np.full((len(observations), len(wavelengths), 2), -1)
-    for image, observation in enumerate(observations):
-        name = exposure_name(observation)
-        if name is None:
-            continue
-        for channel, nm in enumerate(wavelengths):
-            channel_name = f"{name}_{nm:g}" if observation.exposure.endswith(PER_CHANNEL) else name
-            index[image, channel, 0] = factors.setdefault(channel_name, len(factors))
-    middle = int(np.argsort(wavelengths)[(len(wavelengths) - 1) // 2])
-    for image, observation in enumerate(observations):
-        if observation.white_balance == FIXED:
-            continue
-        group = observation.name if observation.white_balance == FREE else observation.white_balance
-        for channel, nm in enumerate(wavelengths):
-            if channel != middle:
-                index[image, channel, 1] = factors.setdefault(f"white_balance_{group}_{nm:g}", len(factors))
-    return list(factors), index
-
-
-def _check_groups(observations: Sequence[Observation], groups: Sequence[str]) -> None:
-    """Refuse an image with a factor of its own whose name is that of a group, which would then share it."""
-    own = {observation.name for observation, group in zip(observations, groups, strict=True) if group == FREE}
-    if both := own & set(groups):
-        raise FitError(f"{both.pop()}: an image with a free factor has the name of a group; rename the group")
-
-
-def stack(observations: Sequence[Observation], wavelengths: Sequence[float]) -> Batch:
-    """The observations as one batch; raises :class:`FitError` if they do not go together."""
-    if not observations:
-        raise FitError("no observation was given")
-    seen = Counter(observation.name for observation in observations)
-    for name, count in seen.items():
-        if count > 1:
-            raise FitError(f"{name}: the name of {count} observations, expected different names")
-    for observation in observations:
-        channels = observation.image.shape[-1]
-        if channels != len(wavelengths):
-            given = ", ".join(f"{nm:g}" for nm in wavelengths)
-            raise FitError(
-                f"{observation.name}: the image has {channels} channels, expected {len(wavelengths)}, one for each "
-                f"wavelength of the atmosphere ({given} nm)"
-            )
-    names, index = exposures(observations, wavelengths)
-    size = max(int(observation.shown.sum()) for observation in observations)
-
-    def padded(field: str, fill: Any) -> Array:
-        rows = []
-        for observation in observations:
-            value = getattr(observation, field)[observation.shown]
-            rows.append(np.concatenate([value, np.broadcast_to(fill, (size - len(value), *value.shape[1:]))]))
-        return number(np.stack(rows))
-
-    def number(value: Any) -> Array:
-        array = np.asarray(value)
-        return jnp.asarray(array, dtype=bool if array.dtype == bool else jnp.result_type(float))
-
-    directions = padded("directions", np.array([0, 0, 1], dtype=np.float32))[..., None, :]
-    if any(observation.block > 1 for observation in observations):
-        first, second = jnp.moveaxis(padded("spread", np.float32(0)), -2, 0)[..., None, :]
-        signs = jnp.asarray([[1, 1], [1, -1], [-1, 1], [-1, -1]], first.dtype)[..., None]
-        directions = directions + signs[:, 0] * first + signs[:, 1] * second
-        directions = directions / jnp.linalg.norm(directions, axis=-1, keepdims=True)
-    return Batch(
-        altitude=number([observation.altitude for observation in observations]),
-        sun=number(np.stack([observation.sun for observation in observations])),
-        directions=directions,
-        measured=jnp.nan_to_num(padded("image", np.float32(0)), posinf=0.0, neginf=0.0),
-        used=padded("used", False),
-        noise=padded("noise", np.float32(0)),
-        noise_shot=padded("noise_shot", np.float32(0)),
-        noise_floor=padded("noise_floor", np.float32(1)),
-        exposure_value=number([observation.exposure_value for observation in observations]),
-        exposure_index=jnp.asarray(index),
-        exposure_count=len(names),
-    )
 
 
 def unstack(observation: Observation, values: Float[np.ndarray, "pixel w"]) -> Float[np.ndarray, "height width w"]:

@@ -9,8 +9,9 @@ the error bar that a fit will report.
 sun's disc through a filter, each under several suns. They share the atmosphere, so one solution of the sky, with its
 derivatives, serves all of them.
 
-*Exposures* are nuisances: where one is not known, the information that is left is what no choice of it could imitate, and the
-projection that leaves it is exact. A factor that several images share is eliminated after their information has been added.
+*Nuisances*: where an exposure is not known, or any other of :mod:`fitting.nuisances`, the information that is left is what no
+choice of it could imitate, and the projection that leaves it is exact. What several images share is eliminated after their
+information has been added. Of a shot only the exposure may be unknown.
 
 *Gain* is the ratio of standard errors without and with a shot. A number that the images do not determine has none, so gains
 are reckoned as if every coordinate had been known beforehand to within :data:`VAGUE` natural units, a factor of twenty. The
@@ -38,11 +39,23 @@ from diffatmo.compiling import compile_ahead, outermost
 from diffatmo.models import Model, Moments
 from diffatmo.numerics import safe_log
 from fitting._errors import FitError
-from fitting.observation import FIXED, NOISE, PER_CHANNEL, Batch, Observation, exposures, observe, sigma, stack
+from fitting.batch import Batch, stack
+from fitting.elimination import eliminate, starting, without
+from fitting.nuisances import gather
+from fitting.observation import FIXED, NOISE, PER_CHANNEL, Observation, observe, sigma
 from fitting.parameters import Coordinates, Parameters, select
 from fitting.quantities import DERIVED, Quantity, numbers, quantities
-from fitting.residuals import Linearisation, Predicted, Problem, jacobian, linearise, planet_shell, triangle
-from fitting.solve import RANK_TOLERANCE
+from fitting.residuals import (
+    Linearisation,
+    Predicted,
+    Problem,
+    jacobian,
+    light,
+    linearise,
+    planet_shell,
+    prior_rows,
+    triangle,
+)
 from fitting.uncertainty import propagate
 
 VAGUE = 3.0
@@ -169,10 +182,10 @@ def candidates(suns: Sequence[float] = SUNS, exposures: Sequence[str] = (FIXED,)
 class Information(NamedTuple):
     """Fisher information FᵀF of some data, held as the factor F: the product would square its condition number.
 
-    The columns of ``factor`` are the logarithms of the exposures named, then the coordinates of the atmosphere.
+    The columns of ``factor`` are the nuisances named, then the coordinates of the atmosphere.
     """
 
-    exposures: tuple[str, ...]
+    nuisances: tuple[str, ...]
     factor: Float[np.ndarray, "rows e+n"]
 
 
@@ -183,28 +196,24 @@ def nothing(size: int) -> Information:
 
 def combined(parts: Sequence[Information]) -> Information:
     """The sum of the information of independent data; at least one part."""
-    names = tuple(dict.fromkeys(name for part in parts for name in part.exposures))
+    names = tuple(dict.fromkeys(name for part in parts for name in part.nuisances))
     rows = []
     for part in parts:
-        own = len(part.exposures)
+        own = len(part.nuisances)
         wide = np.zeros((len(part.factor), len(names) + part.factor.shape[1] - own))
-        wide[:, [names.index(name) for name in part.exposures]] = part.factor[:, :own]
+        wide[:, [names.index(name) for name in part.nuisances]] = part.factor[:, :own]
         wide[:, len(names) :] = part.factor[:, own:]
         rows.append(wide)
     return Information(names, _compact(np.concatenate(rows)))
 
 
-def without_exposures(information: Information) -> Float[np.ndarray, "rows n"]:
-    """A factor of the information on the atmosphere alone, when any exposures may be true.
+def without_nuisances(information: Information) -> Float[np.ndarray, "rows n"]:
+    """A factor of the information on the atmosphere alone, whatever the nuisances.
 
-    What the columns of the exposures span is projected out of the others, which leaves the Schur complement.
+    What their columns span is projected out of the others, which leaves the Schur complement.
     """
-    own = len(information.exposures)
-    nuisance, rest = information.factor[:, :own], information.factor[:, own:]
-    length = np.linalg.norm(nuisance, axis=0)
-    span, singular, _ = np.linalg.svd(nuisance / np.where(length > 0, length, 1), full_matrices=False)
-    span = span[:, singular > RANK_TOLERANCE]
-    return _compact(rest - span @ (span.T @ rest))
+    own = len(information.nuisances)
+    return _compact(without(information.factor[:, :own], information.factor[:, own:]))
 
 
 def _compact(factor: Float[np.ndarray, "rows n"]) -> Float[np.ndarray, "rows n"]:
@@ -213,16 +222,14 @@ def _compact(factor: Float[np.ndarray, "rows n"]) -> Float[np.ndarray, "rows n"]
 
 
 def _reduce(y: Coordinates, linearisation: Linearisation, problem: Problem) -> Float[Array, "n n"]:
-    residual, slope = jacobian(y, linearisation, problem)
-    return triangle(jnp.zeros_like(residual), slope)[:-1, :-1]
+    _, slope = jacobian(y, linearisation, problem)
+    if problem.known:
+        slope = jnp.concatenate([slope, prior_rows(y, problem)[1]])
+    return triangle(jnp.zeros_like(slope[:, 0]), slope)[:-1, :-1]
 
 
-def _information(
-    linearisation: Linearisation, problem: Problem, names: Sequence[str], log_factors: np.ndarray
-) -> Information:
+def _information(y: Coordinates, linearisation: Linearisation, problem: Problem, names: Sequence[str]) -> Information:
     """That of the images of ``problem``, whose weights are known."""
-    start = problem.parameters.start
-    y = jnp.concatenate([start, jnp.asarray(log_factors, start.dtype)])
     factor = np.asarray(outermost(_reduce)(y, linearisation, problem), dtype=np.float64)
     return Information(tuple(names), np.roll(factor, len(names), axis=1))
 
@@ -236,7 +243,7 @@ def _problem(batch: Batch, parameters: Parameters, model: Model) -> Problem:
 
 def _linearised(problem: Problem, names: Sequence[str]) -> Linearisation:
     """The model and its derivatives in all pixels of the images called ``names``."""
-    found = jax.block_until_ready(outermost(linearise)(problem.parameters.start, problem))
+    found = jax.block_until_ready(outermost(linearise)(problem.start, problem))
     used = np.asarray(problem.batch.used)
     for values, what in ((found.radiance, "radiance"), (found.tangents, "derivatives")):
         bad = used & ~np.isfinite(np.asarray(values)).all(axis=tuple(range(2, values.ndim)))
@@ -252,24 +259,18 @@ def of_observations(observations: Sequence[Observation], parameters: Parameters,
         return nothing(parameters.size)
     wavelengths = [float(nm) for nm in parameters.init.wavelengths]
     batch = stack(observations, wavelengths)
-    names, _ = exposures(observations, wavelengths)
-    problem = _problem(batch, parameters, model)
+    labels, _ = gather(observations, wavelengths)
+    problem = _weighed(_problem(batch, parameters, model), batch.measured)
     found = _linearised(problem, [o.name for o in observations])
-    factors = _exposure_factors(np.asarray(found.radiance, dtype=np.float64), batch)
-    expected = found.radiance * batch.exposure(jnp.log(jnp.asarray(factors, found.radiance.dtype)))
-    weight = jnp.where(batch.used[..., None], 1 / sigma(batch, expected), 0)
-    return _information(found, replace(problem, weight=weight), names, np.log(factors))
+    linear = jnp.asarray(starting(np.asarray(found.radiance), batch), problem.start.dtype)
+    y = eliminate(jnp.concatenate([problem.start, linear]), found, problem)
+    problem = _weighed(problem, light(y, found, problem))
+    return _information(y, found, problem, [label.name for label in labels])
 
 
-def _exposure_factors(radiance: Float[np.ndarray, "image pixel w"], batch: Batch) -> Float[np.ndarray, " e"]:
-    """The factors with which the images are nearest to ``radiance``; 1 where they tell nothing of one."""
-    measured, used = np.asarray(batch.measured, np.float64), np.asarray(batch.used)[..., None]
-    expected = radiance * np.asarray(batch.exposure_value)[:, None, None]
-    weight = np.where(used, 1 / np.asarray(sigma(batch, batch.measured), np.float64) ** 2, 0)
-    own = np.asarray(batch.exposure_index)[..., :1] == np.arange(batch.exposure_count)
-    across = np.einsum("ipw,iwe->e", weight * expected * measured, own)
-    along = np.einsum("ipw,iwe->e", weight * expected**2, own)
-    return np.where((across > 0) & (along > 0), across, 1) / np.where((across > 0) & (along > 0), along, 1)
+def _weighed(problem: Problem, light: Predicted) -> Problem:
+    """``problem`` with the weights of pixels whose signal is ``light``."""
+    return replace(problem, weight=jnp.where(problem.batch.used[..., None], 1 / sigma(problem.batch, light), 0))
 
 
 def of_shots(
@@ -293,12 +294,15 @@ def of_shots(
         if isinstance(shot, Photo):
             row = slice(rows[shot.view], rows[shot.view] + 1)
             own = jax.tree.map(lambda x, row=row: x[row], problem.batch)
-            names, index = exposures([replace(frames[shot.view], name=shot.name, exposure=shot.exposure)], wavelengths)
-            own = replace(own, exposure_index=jnp.asarray(index), exposure_count=len(names))
+            labels, nuisances = gather(
+                [replace(frames[shot.view], name=shot.name, exposure=shot.exposure)], wavelengths
+            )
+            own = replace(own, nuisances=nuisances)
             seen = Linearisation(found.radiance[row], found.tangents[row])
             weight = _weight(shot, seen.radiance, own, sensor)
             alone = replace(problem, batch=own, weight=weight, correction=None)
-            part = _information(seen, alone, names, np.zeros(len(names)))
+            y = jnp.concatenate([problem.start, jnp.zeros(nuisances.linear, problem.start.dtype)])
+            part = _information(y, seen, alone, [label.name for label in labels])
         else:
             part = _disc_information(shot, parameters, sensor, altitude)
         result.append(part)
@@ -401,18 +405,18 @@ class Question(NamedTuple):
     def errors(self, information: Information) -> list[float | None]:
         """Standard errors of the numbers; None where they are not determined.
 
-        The exposures stay coordinates: projected out, they would leave rounding where they imitate a parameter.
+        The nuisances stay coordinates: projected out, they would leave rounding where they imitate a parameter.
         """
         factor = information.factor
         rows, columns = factor.shape
         square = np.concatenate([factor, np.zeros((max(columns - rows, 0), columns))])
-        gradient = np.concatenate([np.zeros((len(self.gradient), len(information.exposures))), self.gradient], axis=1)
+        gradient = np.concatenate([np.zeros((len(self.gradient), len(information.nuisances))), self.gradient], axis=1)
         covariance, determined = propagate(square, gradient)
         return [math.sqrt(v) if ok else None for v, ok in zip(np.diag(covariance), determined, strict=True)]
 
     def vague_errors(self, information: Information) -> Float[np.ndarray, " q"]:
         """Standard errors if every coordinate is known to within :data:`VAGUE` besides."""
-        factor = without_exposures(information)
+        factor = without_nuisances(information)
         square = _compact(np.concatenate([factor, np.eye(factor.shape[1]) / VAGUE]))
         return np.linalg.norm(np.linalg.solve(square.T, self.gradient.T), axis=0)
 

@@ -171,7 +171,7 @@ def _factors(result: Findings, name: str | None, wavelengths: Sequence[float]) -
     """For each channel the exposure factor that multiplies it, if any."""
     if name is None:
         return [None] * len(wavelengths)
-    known = {estimate.name: estimate for estimate in result.exposures}
+    known = {estimate.name: estimate for estimate in result.nuisances if estimate.name.startswith("exposure_")}
     names = [name if name in known else spectral_name(name, nm) for nm in wavelengths]
     if not set(names) <= set(known):
         raise FitError(f"exposure: {name!r} is not a factor of this fit, which has {', '.join(known) or 'none'}")

@@ -23,12 +23,13 @@
                       ``initial``, ``truth`` (null: unknown), ``pull`` = (value - truth) / standard_error, ``at_bound``;
                       each a number, or a list for a spectral field
 ``derived``           the same for optical depths and single scattering albedo
-``exposures``         the same for the free exposure factors
+``nuisances``         the same for what else the images depend on (:mod:`fitting.nuisances`), by name: factors of exposure,
+                      white balance and focal length; pedestals, in units of the image; offsets of sun and camera, in degrees
 ``priors``            ``name``, ``value``, ``error``, ``relative`` (of the logarithm), ``source`` of each
 ``undetermined``      names of the numbers that the images do not determine
 ``covariance``        ``names`` and ``matrix`` (of all numbers above), ``correlation`` likewise
-``images``            for each: place, sun, exposure, masked pixels by reason, pixels that a robust loss takes for
-                      outliers, and ``residuals``: per wavelength the median and the root mean square of
+``images``            for each: place, sun as given, which nuisances are free, masked pixels by reason, pixels that a robust
+                      loss takes for outliers, and ``residuals``: per wavelength the median and the root mean square of
                       measured / fitted - 1, and the root mean square in sigmas
 ``timings``           seconds: ``compile_s``, ``solve_s``, ``total_s``
 ====================  ================================================================================================
@@ -65,13 +66,14 @@ from fitting.figures import (
     residual_scale,
 )
 from fitting.findings import Estimate, Findings
-from fitting.observation import FIXED, PER_CHANNEL, Observation, exposure_name
+from fitting.nuisances import KINDS, group_of
+from fitting.observation import FIXED, PER_CHANNEL, Observation
 from fitting.storage import installed_version
 from fitting.tables import notes, page_table, table, verdict
 
 __all__ = ["STYLE", "check_writable", "figure_tag", "file_names", "page", "record", "scene_of", "table", "write"]
 
-SCHEMA, SCHEMA_VERSION = "diffatmo-fit", 1
+SCHEMA, SCHEMA_VERSION = "diffatmo-fit", 2
 
 FIXED_NAMES = ("fit.json", "atmosphere.toml", "report.html")
 IMAGE_PREFIXES = ("fitted_", "residual_")
@@ -143,11 +145,12 @@ def write(
 
 
 def scene_of(result: Findings, observation: Observation) -> Scene | None:
-    """The scene of a fitted image; None if its pixels are not the camera's, or have a factor for each channel."""
-    if observation.block > 1 or observation.exposure.endswith(PER_CHANNEL) or observation.white_balance != FIXED:
+    """The scene of a fitted image; None if its pixels are not the camera's, or more than one exposure and the sky."""
+    others = {getattr(observation, kind) for kind in KINDS if kind != "exposure"}
+    if observation.block > 1 or observation.exposure.endswith(PER_CHANNEL) or others != {FIXED}:
         return None
-    name = exposure_name(observation)
-    factor = 1.0 if name is None else result.estimate(name).value
+    group = group_of(observation, "exposure")
+    factor = 1.0 if group is None else result.estimate(f"exposure_{group}").value
     return Scene(
         atmosphere=result.atmosphere,
         camera=observation.camera,
@@ -216,7 +219,7 @@ def record(result: Findings) -> dict[str, Any]:
             "wavelengths_nm": [float(nm) for nm in result.atmosphere.wavelengths],
             "parameters": _by_field([e for e in result.parameters if not e.derived]),
             "derived": _by_field([e for e in result.parameters if e.derived]),
-            "exposures": _by_field(result.exposures),
+            "nuisances": _by_field(result.nuisances),
             "undetermined": result.undetermined,
             "priors": [asdict(prior) for prior in result.priors],
             "covariance": {"names": result.covariance_names, "matrix": result.covariance},
@@ -244,8 +247,7 @@ def _image_record(result: Findings, number: int) -> dict[str, Any]:
         "altitude_km": observation.altitude,
         "sun_zenith_deg": zenith,
         "sun_azimuth_deg": azimuth,
-        "exposure": observation.exposure,
-        "white_balance": observation.white_balance,
+        **{kind: getattr(observation, kind) for kind in KINDS},
         "exposure_value": observation.exposure_value,
         "pixels_used": len(relative),
         "pixels_masked": observation.masked,
@@ -322,10 +324,12 @@ def _caption(observation: Observation, about: dict[str, Any]) -> str:
     median = ", ".join(f"{100 * value:.2g}" for value in about["residuals"]["median_absolute_relative"])
     of_sigma = ", ".join(f"{value:.2g}" for value in about["residuals"]["rms_sigma"])
     binned = f" (blocks of {observation.block} × {observation.block})" if observation.block > 1 else ""
+    choices = {kind.replace("_", " "): getattr(observation, kind) for kind in KINDS}
+    free = ", ".join(f"{kind} {choice}" for kind, choice in choices.items() if kind == "exposure" or choice != FIXED)
     outlying = f" ({about['pixels_outlying']} of them outliers)" if about["pixels_outlying"] else ""
     return (
         f"{observation.name}: sun at zenith angle {about['sun_zenith_deg']:.1f}°, azimuth "
-        f"{about['sun_azimuth_deg']:.1f}°; altitude {observation.altitude:g} km; exposure {observation.exposure}; "
+        f"{about['sun_azimuth_deg']:.1f}°; altitude {observation.altitude:g} km; {free}; "
         f"{about['pixels_used']} pixels used{binned}{outlying}{f', left out: {masked}' if masked else ''}. "
         f"Median |residual| per wavelength: {median} %; residual over stated noise, RMS: {of_sigma}."
     )

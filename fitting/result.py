@@ -48,7 +48,7 @@ class FitResult(Findings):
         return _FIGURES[what](self)
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """One row for every fitted, derived and exposure number: its name, value, standard error, start, truth, pull, ….
+        """One row for every fitted, derived and nuisance number: its name, value, standard error, start, truth, pull, ….
 
         ``pandas.DataFrame(result.to_rows())`` is the table as a data frame; pandas itself is not needed here.
         """

@@ -13,6 +13,9 @@ a natural unit of the coordinates, and parameters held by their bounds, do not c
 *Resolution.* The steps are those of the model as it is given. A model that knows a ``finer`` one of itself is then compared
 with it at the optimum, and the last pass explains the images by the finer model there, with the slopes of the first.
 
+*Linear nuisances*, exposures and pedestals, are at their optimum wherever χ² is evaluated, and the search is in the other
+coordinates alone (:mod:`fitting.elimination`).
+
 *Noise.* sigma depends on the expected signal, which is known only after the fit. Taken from the noisy pixels it
 favours those that came out dark, and biases the radiance by about -2 (relative noise)²: 2e-4 for 1 % noise, ten
 standard errors of a well-determined parameter. So the fit starts with sigma from the measured signal, and goes on with that
@@ -39,21 +42,27 @@ from diffatmo.atmosphere import Atmosphere
 from diffatmo.compiling import compile_ahead, outermost
 from diffatmo.models.base import Model
 from fitting._errors import FitError
+from fitting.batch import Batch, stack
 from fitting.checkpoint import Checkpoint, digest, load, save
-from fitting.observation import Batch, Observation, exposures, sigma, stack
+from fitting.elimination import RANK_TOLERANCE, eliminate, profile, starting
+from fitting.nuisances import Label, gather
+from fitting.observation import Observation, sigma
 from fitting.parameters import Coordinates, Parameters, select
 from fitting.priors import Prior, collect
 from fitting.residuals import (
     Linearisation,
     Predicted,
     Problem,
+    expected,
     jacobian,
+    light,
     linearise,
     planet_shell,
     predict,
     prior_rows,
     projected,
     reduce,
+    reduce_images,
     smooth_fields,
     whitened,
 )
@@ -105,9 +114,6 @@ FIELD_DEGREE = 3
 SETTLED = 0.9
 """Ratio of the scales of a robust loss, from one stage to the next, above which it does not fall any further."""
 
-RANK_TOLERANCE = 3e-5
-"""Singular values of J, scaled to columns of length one, below this are rounding: J is computed in float32."""
-
 INTERRUPTED = "interrupted by the user"
 OUT_OF_STEPS = "stopped: not converged in the steps allowed"
 UNLIKE = (
@@ -153,7 +159,7 @@ class Solution(NamedTuple):
 
     parameters: Parameters
     batch: Batch
-    exposure_names: list[str]
+    nuisances: list[Label]
     y: Coordinates
     triangle: Float[np.ndarray, "n+1 n+1"]
     predicted: Float[np.ndarray, "image pixel w"]
@@ -184,9 +190,10 @@ class Solution(NamedTuple):
         return self.residual_count - self.y.size
 
 
-def _correction(coordinates: Coordinates, problem: Problem, radiance: Predicted, finer: Model) -> Predicted:
+def _correction(x: Coordinates, problem: Problem, radiance: Predicted, finer: Model) -> Predicted:
     """What ``finer`` expects over the ``radiance`` of the problem's own model; 1 where there is nothing to compare."""
-    wanted = predict(finer.sky(problem.parameters.atmosphere(coordinates)), problem.batch)
+    coordinates, moved = problem.parts(x)
+    wanted = predict(finer.sky(problem.parameters.atmosphere(coordinates)), problem.batch.views(moved))
     known = problem.batch.used[..., None] & (radiance > 0) & (wanted > 0)
     ratio = wanted / jnp.where(known, radiance, 1)
     return jnp.where(known, jnp.clip(ratio, 1 / LARGEST_CORRECTION, LARGEST_CORRECTION), 1)
@@ -196,8 +203,7 @@ def _projected(
     y: Coordinates, linearisation: Linearisation, fields: Float[Array, "image pixel b"], problem: Problem
 ) -> Float[Array, "image w b n"]:
     _, slope = jacobian(y, linearisation, problem)
-    expected = linearisation.radiance * problem.batch.exposure(problem.split(y)[1])
-    return projected(slope, expected, fields, problem)
+    return projected(slope, light(y, linearisation, problem), fields, problem)
 
 
 def _deviation(problem: Problem) -> Float[np.ndarray, "image w"]:
@@ -303,7 +309,8 @@ def _minimise(
 
     ``keep`` is given the best point and the step size after every step; ``step_size`` is that of the first one.
     """
-    state = outermost(_start)(y)
+    x, linear = problem.split(y)
+    state = outermost(_start)(x)
     limits = jax.tree.map(np.asarray, problem.limits)
     freedom = max(_count(problem.batch) - y.size, 1)
     stage = history[-1].stage + 1 if history else 1
@@ -312,15 +319,19 @@ def _minimise(
     try:
         while best is None or len(history) < max_steps:
             started = time.perf_counter()
-            trial = outermost(_shorten)(y, state.y_eval, limits)
+            trial = outermost(_shorten)(x, state.y_eval, limits)
             linearisation = start if best is None else evaluate(trial, problem)
-            factor = np.asarray(outermost(reduce)(trial, linearisation, problem), dtype=np.float64)
+            whole = eliminate(jnp.concatenate([trial, linear]), linearisation, problem)
+            factor = np.asarray(outermost(reduce)(whole, linearisation, problem), dtype=np.float64)
             finite = bool(np.all(np.isfinite(factor)))
             if finite:
-                chi2, held = float(np.sum(factor[:, -1] ** 2)), _hold(factor, np.asarray(trial), limits)
+                chi2, held = (
+                    float(np.sum(factor[:, -1] ** 2)),
+                    _hold(profile(factor, linear.size), np.asarray(trial), limits),
+                )
             else:
                 # An infinitely bad point, in numbers whose squares do not overflow: the step is rejected and shortened.
-                chi2, held = math.inf, np.diag([0.0] * y.size + [1e15])
+                chi2, held = math.inf, np.diag([0.0] * x.size + [1e15])
             size = state.search_state.step_size
             if best is None:
                 size = size if step_size is None else jnp.full_like(size, step_size)
@@ -331,12 +342,12 @@ def _minimise(
                 previous, misfit = misfit, max(1.0, chi2 / freedom)
                 size = size * (previous / misfit)
             state = eqx.tree_at(lambda s: (s.y_eval, s.search_state.step_size), state, (trial, size))
-            change = float(np.max(np.abs(np.asarray(trial) - np.asarray(y))))
-            plane = jnp.asarray(held / math.sqrt(scale), dtype=y.dtype)
-            y, state = outermost(_step)(y, state, (plane[:, -1], plane[:, :-1], trial))
-            accepted = best is None or (finite and np.array_equal(y, trial))
+            change = float(np.max(np.abs(np.asarray(trial) - np.asarray(x))))
+            plane = jnp.asarray(held / math.sqrt(scale), dtype=x.dtype)
+            x, state = outermost(_step)(x, state, (plane[:, -1], plane[:, :-1], trial))
+            accepted = best is None or (finite and np.array_equal(x, trial))
             if best is None or accepted:
-                best = _Point(y, linearisation, factor, chi2, distance(held, misfit))
+                best, linear = _Point(whole, linearisation, factor, chi2, distance(held, misfit)), whole[x.size :]
             rejections = 0 if accepted else rejections + 1
             history.append(
                 Step(
@@ -354,7 +365,7 @@ def _minimise(
             keep(best.y, float(state.search_state.step_size))
             if progress is not None:
                 progress(history[-1])
-            if np.array_equal(outermost(_shorten)(y, state.y_eval, limits), y):
+            if np.array_equal(outermost(_shorten)(x, state.y_eval, limits), x):
                 rejections = REJECTIONS_AT_MOST
             end = _end(best.distance, rejections, tolerance)
             if end is not None:
@@ -367,18 +378,17 @@ def _minimise(
 
 
 def _shares(best: _Point, problem: Problem) -> dict[str, Any]:
-    """What the images and what the priors contribute, and what a robust loss does."""
+    """What the images contribute and what is known besides, and what a robust loss does."""
     shares: dict[str, Any] = {
         "of_images": best.triangle,
         "of_priors": np.zeros((0, best.y.size)),
         "inflation": None,
         "outliers": [0] * problem.batch.used.shape[0],
     }
-    if problem.priors is not None:
-        alone = replace(problem, priors=None)
-        factor = outermost(reduce)(best.y, best.linearisation, alone)
+    if problem.known:
+        factor = outermost(reduce_images)(best.y, best.linearisation, problem)
         shares["of_images"] = np.asarray(factor, dtype=np.float64)
-        shares["of_priors"] = np.asarray(outermost(prior_rows)(best.y, problem.priors, problem)[1], dtype=np.float64)
+        shares["of_priors"] = np.asarray(outermost(prior_rows)(best.y, problem)[1], dtype=np.float64)
     if problem.loss is not None:
         off = outermost(whitened)(best.y, best.linearisation, problem)
         shares["inflation"] = float(problem.loss.inflation(off, problem.batch.used))
@@ -427,9 +437,9 @@ def _check_weights(batch: Batch, names: Sequence[str]) -> None:
             )
 
 
-def _weigh(problem: Problem, expected: Array) -> Problem:
-    """``problem`` with the weights of pixels whose expected signal is ``expected``."""
-    weight = jnp.where(problem.batch.used[..., None], 1 / sigma(problem.batch, expected), 0)
+def _weigh(problem: Problem, light: Array) -> Problem:
+    """``problem`` with the weights of pixels whose signal is ``light``."""
+    weight = jnp.where(problem.batch.used[..., None], 1 / sigma(problem.batch, light), 0)
     return replace(problem, weight=weight)
 
 
@@ -439,20 +449,6 @@ def _rescaled(y: Coordinates, linearisation: Linearisation, problem: Problem) ->
         return problem
     found = scale(np.asarray(outermost(whitened)(y, linearisation, problem)), np.asarray(problem.batch.used))
     return replace(problem, loss=Loss(problem.loss.name, jnp.asarray(found, y.dtype)))
-
-
-def _expected(y: Coordinates, linearisation: Linearisation, problem: Problem) -> Predicted:
-    return linearisation.radiance * problem.batch.exposure(problem.split(y)[1])
-
-
-def _starting_exposures(radiance: np.ndarray, batch: Batch) -> Float[np.ndarray, " e"]:
-    """Logarithms of the exposures that bring the median of measured / expected to one, with a neutral white balance."""
-    expected = radiance * np.asarray(batch.exposure_value)[:, None, None]
-    ratio = np.asarray(batch.measured) / np.where(expected > 0, expected, np.inf)
-    usable = np.asarray(batch.used)[..., None] & (ratio > 0) & np.isfinite(ratio)
-    index = np.broadcast_to(np.asarray(batch.exposure_index)[:, None, :, 0], ratio.shape)
-    chosen = [ratio[usable & (index == number)] for number in range(batch.exposure_count)]
-    return np.array([np.log(np.median(values)) if values.size else 0.0 for values in chosen])
 
 
 def solve(
@@ -488,8 +484,8 @@ def solve(
         saved = load(checkpoint, identity)
     wavelengths = [float(nm) for nm in init.wavelengths]
     batch = stack(observations, wavelengths)
-    names, _ = exposures(observations, wavelengths)
-    size = parameters.size + batch.exposure_count
+    labels, _ = gather(observations, wavelengths)
+    size = parameters.size + batch.nuisances.size
     if _count(batch) < size:
         raise FitError(
             f"{_count(batch)} pixels and channels cannot determine {size} parameters; mask less or free less"
@@ -500,27 +496,25 @@ def solve(
     problem = Problem(model, parameters, batch, signal, of_planet, jnp.ones_like(signal), collect(priors, parameters))
     if loss is not None:
         problem = replace(problem, loss=Loss(loss, jnp.ones((), signal.dtype)))
-    compiling = [compile_ahead(linearise, parameters.start, problem)]
+    compiling = [compile_ahead(linearise, problem.start, problem)]
     finer = model.finer() if refine else None
     if finer is not None:
-        compiling.append(compile_ahead(_correction, parameters.start, problem, signal, finer))
+        compiling.append(compile_ahead(_correction, problem.start, problem, signal, finer))
     problem = replace(problem, shell=outermost(planet_shell)(model, parameters))
     problem = outermost(_weigh)(problem, signal)
     compiling[0].join()
     seconds: list[float] = []
 
-    def evaluate(y: Coordinates, problem: Problem) -> Linearisation:
+    def evaluate(x: Coordinates, problem: Problem) -> Linearisation:
         before = time.perf_counter()
-        result = jax.block_until_ready(outermost(linearise)(y[: parameters.size], problem))
+        result = jax.block_until_ready(outermost(linearise)(x, problem))
         seconds.append(time.perf_counter() - before)
         return result
 
-    coordinates = parameters.start if saved is None else jnp.asarray(saved.y[: parameters.size], parameters.start.dtype)
-    start = evaluate(coordinates, problem)
+    x = problem.start if saved is None else jnp.asarray(saved.y[: problem.size], problem.start.dtype)
+    start = evaluate(x, problem)
     _check_finite(start, batch, [observation.name for observation in observations])
-    log_factors = (
-        _starting_exposures(np.asarray(start.radiance), batch) if saved is None else saved.y[parameters.size :]
-    )
+    linear = starting(np.asarray(start.radiance), batch) if saved is None else saved.y[problem.size :]
     history = [Step(**row) for row in saved.history] if saved is not None else []
     final = saved is not None and saved.final
 
@@ -538,7 +532,7 @@ def solve(
     rough = max(tolerance, FIRST_PASS_TOLERANCE)
     # A search that goes on has the step size that it had, any other begins with its own.
     step_size = None if saved is None else saved.step_size
-    y, scales = jnp.concatenate([coordinates, jnp.asarray(log_factors, coordinates.dtype)]), [math.inf]
+    y, scales = jnp.concatenate([x, jnp.asarray(linear, x.dtype)]), [math.inf]
     interrupted = False
     while not final:
         problem = _rescaled(y, start, problem)
@@ -554,15 +548,15 @@ def solve(
             break
     if not interrupted:
         final = True
-        problem = outermost(_weigh)(problem, outermost(_expected)(y, start, problem))
+        problem = outermost(_weigh)(problem, outermost(light)(y, start, problem))
         problem = _rescaled(y, start, problem)
         best = search(y, start, problem, tolerance=tolerance, step_size=step_size)
     model_error = np.zeros((size, size))
     if finer is not None and best.converged:
-        coordinates, radiance = best.y[: parameters.size], best.linearisation.radiance
+        x, radiance = best.y[: problem.size], best.linearisation.radiance
         try:
             compiling[-1].join()
-            correction = jax.block_until_ready(outermost(_correction)(coordinates, problem, radiance, finer))
+            correction = jax.block_until_ready(outermost(_correction)(x, problem, radiance, finer))
             problem = replace(problem, correction=correction)
             start = Linearisation(radiance * correction, best.linearisation.tangents * correction[..., None])
             best = search(best.y, start, problem, tolerance=tolerance)
@@ -581,10 +575,10 @@ def solve(
     return Solution(
         parameters=parameters,
         batch=batch,
-        exposure_names=names,
+        nuisances=labels,
         y=best.y,
         triangle=best.triangle,
-        predicted=np.asarray(outermost(_expected)(best.y, best.linearisation, problem)),
+        predicted=np.asarray(outermost(expected)(best.y, best.linearisation, problem)),
         model_error=model_error,
         history=history,
         residual_count=_count(batch),

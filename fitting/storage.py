@@ -32,7 +32,7 @@ from fitting.observation import Observation
 from fitting.priors import Prior
 from fitting.solve import Step
 
-SCHEMA, SCHEMA_VERSION = "diffatmo-result", 1
+SCHEMA, SCHEMA_VERSION = "diffatmo-result", 2
 
 RECORD = "record"
 

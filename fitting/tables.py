@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
@@ -79,7 +80,7 @@ def _row(estimate: Estimate, *, first: bool) -> _Row:
 
 def _rows(result: Findings) -> list[tuple[_Row, Estimate, bool]]:
     """All rows of the table, with what they show, and whether a rule goes above (a new kind of number begins)."""
-    groups = [[e for e in result.parameters if e.derived == derived] for derived in (False, True)] + [result.exposures]
+    groups = [[e for e in result.parameters if e.derived == derived] for derived in (False, True)] + [result.nuisances]
     rows = []
     for number, group in enumerate(groups):
         before = None
@@ -138,9 +139,14 @@ def notes(result: Findings) -> list[str]:
         found.append(f"Known beforehand: {known}. The column 'by images' says how much of each precision is their own.")
     if sum(result.outliers):
         found.append(f"{sum(result.outliers)} pixels count for less than half, as outliers.")
+    # Combinations are products of powers, which offsets and pedestals, of either sign, have no part in.
+    signed = {e.name for e in result.nuisances if e.unit == "deg" or e.name.startswith("pedestal_")}
+    kept = np.array([n for n, name in enumerate(result.covariance_names) if name not in signed], dtype=int)
     if said := [
         combination.text
-        for combination in combinations(result.covariance, [result.estimate(name) for name in result.covariance_names])
+        for combination in combinations(
+            result.covariance[np.ix_(kept, kept)], [result.estimate(result.covariance_names[number]) for number in kept]
+        )
     ]:
         found.append(f"Better known together than alone: {'; '.join(said[:6])}.")
     return found
@@ -181,7 +187,7 @@ def fragment(result: Findings) -> str:
 
 
 def to_rows(result: Findings) -> list[dict[str, Any]]:
-    """One row for each number, with None for what is not known; ``kind`` is ``fitted``, ``derived`` or ``exposure``."""
+    """One row for each number, with None for what is not known; ``kind`` is ``fitted``, ``derived`` or ``nuisance``."""
     kinds = [("derived" if e.derived else "fitted", e) for e in result.parameters]
     return [
         {
@@ -198,7 +204,7 @@ def to_rows(result: Findings) -> list[dict[str, Any]]:
             "pull": estimate.pull,
             "at_bound": estimate.at_bound,
         }
-        for kind, estimate in [*kinds, *(("exposure", e) for e in result.exposures)]
+        for kind, estimate in [*kinds, *(("nuisance", e) for e in result.nuisances)]
     ]
 
 

@@ -29,13 +29,15 @@ from jaxtyping import Array, Float
 from diffatmo.atmosphere import Atmosphere
 from diffatmo.compiling import outermost
 from diffatmo.models import Model, Moments
+from fitting.elimination import RANK_TOLERANCE
 from fitting.findings import Estimate
+from fitting.nuisances import Nuisances, assumed
 from fitting.observation import Observation, unstack
 from fitting.parameters import Coordinates, Parameters
 from fitting.priors import Prior
 from fitting.quantities import numbers, quantities
 from fitting.result import FitResult
-from fitting.solve import MAX_STEPS, RANK_TOLERANCE, TOLERANCE, Progress, Solution, solve
+from fitting.solve import MAX_STEPS, TOLERANCE, Progress, Solution, solve
 
 
 def propagate(
@@ -79,17 +81,17 @@ def data_shares(
 
 
 def _physical(
-    y: Coordinates, parameters: Parameters
+    y: Coordinates, parameters: Parameters, nuisances: Nuisances
 ) -> tuple[Float[Array, " q"], tuple[Float[Array, " q"], Atmosphere]]:
     """The numbers that are reported, once to be differentiated and once for themselves, and the atmosphere."""
     atmosphere = parameters.atmosphere(y[: parameters.size])
     found = numbers(atmosphere, [*parameters.fields, *parameters.derived])
-    values = jnp.concatenate([found, jnp.exp(y[parameters.size :])])
+    values = jnp.concatenate([found, nuisances.values(y[parameters.size :])])
     return values, (values, atmosphere)
 
 
-def _slopes(y: Coordinates, parameters: Parameters) -> Any:
-    return jax.jacfwd(_physical, has_aux=True)(y, parameters)
+def _slopes(y: Coordinates, parameters: Parameters, nuisances: Nuisances) -> Any:
+    return jax.jacfwd(_physical, has_aux=True)(y, parameters, nuisances)
 
 
 def summarise(
@@ -108,7 +110,7 @@ def summarise(
     fitted_quantities = quantities(free, wavelengths)
     all_quantities = fitted_quantities + quantities(derived, wavelengths)
 
-    slopes, (numbers_found, atmosphere) = outermost(_slopes)(solution.y, parameters)
+    slopes, (numbers_found, atmosphere) = outermost(_slopes)(solution.y, parameters, solution.batch.nuisances)
     values, gradient = np.asarray(numbers_found, dtype=float), np.asarray(slopes, dtype=float)
     reduced_chi2 = solution.chi2 / max(solution.degrees_of_freedom, 1)
     scale = max(1.0, math.sqrt(reduced_chi2 if solution.inflation is None else solution.inflation))
@@ -137,16 +139,25 @@ def summarise(
         )
         for i, quantity in enumerate(all_quantities)
     ]
-    factors = [
-        Estimate(name, name, None, "", float(values[i]), errors[i], None)
-        for i, name in enumerate(solution.exposure_names, start=len(all_quantities))
+    nuisances = [
+        Estimate(
+            name=label.name,
+            field=label.name,
+            wavelength=None,
+            unit=label.unit,
+            value=float(values[i]),
+            standard_error=errors[i],
+            initial=None,
+            data_share=shares[i] if determined[i] else None,
+        )
+        for i, label in enumerate(solution.nuisances, start=len(all_quantities))
     ]
     return FitResult(
         atmosphere=atmosphere,
         parameters=estimates,
-        exposures=factors,
+        nuisances=nuisances,
         covariance=covariance,
-        covariance_names=[estimate.name for estimate in [*estimates, *factors]],
+        covariance_names=[estimate.name for estimate in [*estimates, *nuisances]],
         chi2=solution.chi2,
         degrees_of_freedom=solution.degrees_of_freedom,
         error_scale=scale,
@@ -157,9 +168,9 @@ def summarise(
         timings=solution.timings,
         observations=list(observations),
         fitted=[unstack(o, image) for o, image in zip(observations, solution.predicted, strict=True)],
-        priors=list(priors),
+        priors=[*priors, *(Prior(*known) for known in assumed(observations))],
         outliers=solution.outliers,
-        undetermined=[e.name for e in [*estimates, *factors] if e.standard_error is None],
+        undetermined=[e.name for e in [*estimates, *nuisances] if e.standard_error is None],
         model=model,
         refine=refine,
     )

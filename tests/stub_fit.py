@@ -58,7 +58,7 @@ def record(name, value, **exposures):
             "wavelengths_nm": [680.0, 550.5],
             "parameters": {"mie_g": entry(value, 0.1), "ozone_absorption": entry([1.0, value], [0.5, None])},
             "derived": {},
-            "exposures": {key: entry(item, 0.2) for key, item in exposures.items()},
+            "nuisances": {key: entry(item, 0.2) for key, item in exposures.items()},
             "images": [{"name": name}],
             "timings": {"total_s": 0.1234567},
         }

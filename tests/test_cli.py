@@ -296,10 +296,10 @@ def test_fit_of_a_scene_file(tmp_path, s1, start, toy):
     )
     assert main(["fit", "--config", str(folder / "scene.toml"), "-o", str(tmp_path / "out")]) == 0
     record = json.loads((tmp_path / "out" / "fit.json").read_text())
-    assert list(record["exposures"]) == ["exposure_camera"]
+    assert list(record["nuisances"]) == ["exposure_camera"]
     ratio = np.divide(record["parameters"]["rayleigh_scattering"]["value"], s1.rayleigh_scattering)
     assert np.allclose(ratio, ratio[0], rtol=1e-5)
-    assert record["exposures"]["exposure_camera"]["value"] * ratio[0] == pytest.approx(2, rel=0.05)
+    assert record["nuisances"]["exposure_camera"]["value"] * ratio[0] == pytest.approx(2, rel=0.05)
     assert record["parameters"]["mie_g"]["truth"] is None
 
 

@@ -10,7 +10,9 @@ import fitting
 from diffatmo import sun
 from diffatmo.camera import Equirectangular, Fisheye
 from fitting import FitError
-from fitting.observation import exposures, sigma, stack, unstack
+from fitting.batch import stack
+from fitting.nuisances import gather
+from fitting.observation import sigma, unstack
 
 CAMERA = Equirectangular(32, 64)
 SUN = sun.direction(zenith=math.radians(40), azimuth=0.0)
@@ -164,7 +166,8 @@ def test_stack_pads_and_unstack_restores():
 def test_exposure_groups():
     given = ["fixed", "free", "camera", "camera", "free-per-channel", "lens-per-channel"]
     images = [observe(name=f"i{n}", exposure=exposure, exposure_value=2.0) for n, exposure in enumerate(given)]
-    names, index = exposures(images, NM)
+    labels, found = gather(images, NM)
+    names, index = [label.name for label in labels], np.asarray(found.factor_index)
     assert names == [
         *("exposure_i1", "exposure_camera"),
         *(f"exposure_{own}_{nm}" for own in ("i4", "lens") for nm in (680, 550, 440)),
@@ -178,7 +181,8 @@ def test_exposure_groups():
 def test_white_balance_leaves_the_middle_channel():
     given = [("free", "fixed"), ("free", "lens"), ("body", "lens"), ("body", "free")]
     images = [observe(name=f"i{n}", exposure=e, white_balance=w) for n, (e, w) in enumerate(given)]
-    names, index = exposures(images, NM)
+    labels, found = gather(images, NM)
+    names, index = [label.name for label in labels], np.asarray(found.factor_index)
     assert names[:3] == ["exposure_i0", "exposure_i1", "exposure_body"]
     assert names[3:] == [f"white_balance_{own}_{nm}" for own in ("lens", "i3") for nm in (680, 440)]
     assert index[..., 1].tolist() == [[-1] * 3, [3, -1, 4], [3, -1, 4], [5, -1, 6]]

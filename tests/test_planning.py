@@ -26,7 +26,7 @@ from fitting.planning import (
     combined,
     of_observations,
     of_shots,
-    without_exposures,
+    without_nuisances,
 )
 
 DEG = math.radians(1)
@@ -67,7 +67,7 @@ def close(a, b, tolerance=1e-5):
 def test_information_adds(parts):
     first, second = parts["fixed"][:2]
     both = combined([first, second])
-    assert both.exposures == ()
+    assert both.nuisances == ()
     # The sum is made by an orthogonal transformation in double precision.
     close(fisher(both.factor), fisher(first.factor) + fisher(second.factor), 1e-12)
 
@@ -79,22 +79,22 @@ def test_exposures_are_eliminated_exactly():
     joint = np.zeros((50, 5))
     joint[:30], joint[30:, 1:] = one.factor, two.factor
     together = np.linalg.inv(fisher(joint))[2:, 2:]
-    np.testing.assert_allclose(fisher(without_exposures(combined([one, two]))), np.linalg.inv(together), rtol=1e-10)
+    np.testing.assert_allclose(fisher(without_nuisances(combined([one, two]))), np.linalg.inv(together), rtol=1e-10)
     # Sharing a factor with others determines it better than having one of one's own.
     apart = combined([one, Information(("c",), two.factor)])
-    gained = fisher(without_exposures(combined([one, two]))) - fisher(without_exposures(apart))
+    gained = fisher(without_nuisances(combined([one, two]))) - fisher(without_nuisances(apart))
     assert np.linalg.eigvalsh(gained).min() > -1e-10
 
 
 def test_an_exposure_that_nothing_depends_on_takes_nothing_away():
     factor = np.random.default_rng(0).standard_normal((9, 4))
     factor[:, 0] = 0
-    np.testing.assert_allclose(fisher(without_exposures(Information(("dark",), factor))), fisher(factor[:, 1:]))
+    np.testing.assert_allclose(fisher(without_nuisances(Information(("dark",), factor))), fisher(factor[:, 1:]))
 
 
 def test_an_unknown_exposure_never_helps(parts):
     for known, *others in zip(*(parts[exposure] for exposure in (*EXPOSURES, "camera")), strict=True):
-        full, free, channels, shared = (fisher(without_exposures(part)) for part in (known, *others))
+        full, free, channels, shared = (fisher(without_nuisances(part)) for part in (known, *others))
         # The disc tells nothing of some coordinates.
         size = np.maximum(np.sqrt(np.diag(full)), 1e-6)
         for more, less in pairwise((full, free, channels)):
@@ -153,7 +153,7 @@ def test_a_shot_tells_what_the_photo_will():
     image = shoot(photo, "taken")
     taken = of_observations([image], parameters(), Toy())
     planned = of_shots([photo], parameters(), Toy(), sensor=Sensor.like([image]), altitude=0.1)[0]
-    close(fisher(without_exposures(planned)), fisher(without_exposures(taken)), 0.03)
+    close(fisher(without_nuisances(planned)), fisher(without_nuisances(taken)), 0.03)
 
 
 def test_the_disc_tells_the_optical_depth():
@@ -161,7 +161,7 @@ def test_the_disc_tells_the_optical_depth():
     free = parameters(["rayleigh_scattering"], {})
     shots = [SunsDisc(planning.DISC, 0.0, exposure) for exposure in EXPOSURES]
     known, free_factor, per_channel = (
-        without_exposures(part) for part in of_shots(shots, free, Toy(), sensor=Sensor(disc_noise=0.02), altitude=0.0)
+        without_nuisances(part) for part in of_shots(shots, free, Toy(), sensor=Sensor(disc_noise=0.02), altitude=0.0)
     )
     depth = np.asarray(toy_sky.truth().rayleigh_optical_depth) * (1 - math.exp(-100 / 8))
     np.testing.assert_allclose(fisher(known), np.diag((depth / 0.02) ** 2), rtol=1e-4, atol=1e-6)

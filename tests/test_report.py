@@ -40,7 +40,7 @@ def test_all_files_are_there(written):
 
 def test_record(written):
     data, found = load(written[0]), toy_sky.result()
-    assert (data["schema"], data["schema_version"]) == ("diffatmo-fit", 1)
+    assert (data["schema"], data["schema_version"]) == ("diffatmo-fit", 2)
     assert data["converged"] is True
     assert data["reduced_chi2"] == pytest.approx(found.reduced_chi2)
     assert data["wavelengths_nm"] == [680, 550, 440]

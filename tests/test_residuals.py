@@ -8,9 +8,10 @@ import pytest
 import toy_sky
 
 from diffatmo.models import RayMarch
-from fitting.observation import sigma, stack
+from fitting.batch import stack
+from fitting.observation import sigma
 from fitting.parameters import select
-from fitting.residuals import Problem, jacobian, linearise, projected, residuals, smooth_fields, triangle
+from fitting.residuals import Problem, jacobian, light, linearise, projected, residuals, smooth_fields, triangle
 
 NM = [680.0, 550.0, 440.0]
 
@@ -26,7 +27,7 @@ def problem(model, free, tie=None, exposure=("fixed", "fixed"), pixels=40):
     batch = stack(images, NM)
     parameters = select(toy_sky.truth(), free, tie)
     weight = jnp.where(batch.used[..., None], 1 / sigma(batch, batch.measured), 0)
-    y = jnp.concatenate([parameters.start, 0.1 * jnp.arange(batch.exposure_count)])
+    y = jnp.concatenate([parameters.start, 0.1 * jnp.arange(batch.nuisances.size)])
     return Problem(model, parameters, batch, weight), y
 
 
@@ -38,7 +39,7 @@ def both(y, ours):
 @pytest.mark.parametrize("tie", [{"mie_absorption": "start"}, {"mie": "angstrom", "rayleigh_scattering": "lambda^-4"}])
 def test_coloured_jacobian_is_the_jacobian(x64, tie):
     ours, y = problem(toy_sky.Toy(), toy_sky.FREE, tie=tie, exposure=("free", "lens-per-channel"))
-    assert ours.batch.exposure_count == 4
+    assert ours.batch.nuisances.factors == 4
     residual, coloured = both(y, ours)
     np.testing.assert_allclose(residual, eqx.filter_jit(residuals)(y, ours), rtol=1e-12)
     plain = eqx.filter_jit(jax.jacfwd(residuals))(y, ours)
@@ -113,7 +114,7 @@ def test_projection_is_the_jacobian_transposed():
     linearisation = linearise(y[: ours.parameters.size], ours)
     _, slope = jacobian(y, linearisation, ours)
     fields = jnp.asarray(smooth_fields(ours.batch, 1), y.dtype)
-    expected = linearisation.radiance * ours.batch.exposure(ours.split(y)[1])
+    expected = light(y, linearisation, ours)
     got = projected(slope, expected, fields, ours)
     image, channel, field = 1, 2, 3
     wrong = expected.at[image, :, channel].multiply(1 + fields[image, :, field])

@@ -45,7 +45,7 @@ def with_everything() -> FitResult:
         found,
         atmosphere=dataclasses.replace(found.atmosphere, mie_phase=table),
         parameters=[*found.parameters[:3], unknown, held, *found.parameters[5:]],
-        exposures=[fitting.Estimate("exposure_a", "exposure_a", None, "", 1.1, 0.01, None)],
+        nuisances=[fitting.Estimate("exposure_a", "exposure_a", None, "", 1.1, 0.01, None)],
         covariance=covariance,
         history=[found.history[0]._replace(chi2=float("inf"), accepted=False), *found.history],
         observations=[dataclasses.replace(o, camera=c) for o, c in zip(found.observations, cameras, strict=True)],
@@ -123,7 +123,7 @@ def test_the_file_runs_no_code_and_explains_itself(saved):
     with np.load(saved, allow_pickle=False) as file:
         np.testing.assert_array_equal(file["observations.1.image"], with_everything().observations[1].image)
         record = json.loads(file["record"].tobytes())
-    assert (record["schema"], record["schema_version"]) == ("diffatmo-result", 1)
+    assert (record["schema"], record["schema_version"]) == ("diffatmo-result", 2)
     assert record["result"]["iterations"] == with_everything().iterations
 
 
@@ -191,10 +191,10 @@ def test_other_files_are_refused(saved):
     for content in (b"not a fit", pickled(), array.getvalue(), zipped.getvalue(), npz(image=np.zeros(3))):
         assert "saved fit" in refusal(saved, content)
     assert "schema" in refusal(saved, npz(record=text({"schema": "diffatmo-fit"})))
-    newer = {"schema": storage.SCHEMA, "schema_version": 2, "version": "9.9", "result": {}}
+    newer = {"schema": storage.SCHEMA, "schema_version": 3, "version": "9.9", "result": {}}
     assert "got 2 (diffatmo 9.9), expected 1" in refusal(saved, npz(record=text(newer)))
     for result in ({}, {"chi2": {"type": "os.system"}}, {"model": {"type": "model", "name": "x", "fields": {}}}, 3):
-        refusal(saved, npz(record=text(newer | {"schema_version": 1, "result": result})))
+        refusal(saved, npz(record=text(newer | {"schema_version": 2, "result": result})))
     refusal(saved, npz(record=np.array([3.5])))
 
 
@@ -256,7 +256,7 @@ def test_rows(tmp_path):
     found = with_everything()
     rows = found.to_rows()
     assert [row["name"] for row in rows] == [*found.covariance_names, "exposure_a"]
-    assert {row["kind"] for row in rows} == {"fitted", "derived", "exposure"}
+    assert {row["kind"] for row in rows} == {"fitted", "derived", "nuisance"}
     unknown = rows[3]
     assert (unknown["name"], unknown["standard_error"], unknown["pull"]) == ("rayleigh_scale_height", None, None)
     found.to_csv(tmp_path / "fit.csv")
@@ -334,7 +334,7 @@ def test_fitted_exposures_enter_the_prediction_when_asked(group):
     images = toy_sky.observations(exposure=(group,) * 3, factors=(2, 2, 2))
     found = fitting.fit(images, init=toy_sky.change(toy_sky.truth(), mie_g=0.7), free=free, model=Toy())
     plain, exposed = found.predict(scene()), found.predict(scene(), exposure="exposure_camera")
-    factors = np.array([estimate.value for estimate in found.exposures])
+    factors = np.array([estimate.value for estimate in found.nuisances])
     np.testing.assert_allclose(factors, 2, rtol=0.05)
     np.testing.assert_allclose(exposed.radiance, plain.radiance * factors, rtol=1e-5)
     if group == "camera":

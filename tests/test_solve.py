@@ -76,8 +76,8 @@ def test_free_exposures_are_recovered():
     init = toy_sky.change(toy_sky.truth(), mie_g=0.6, mie_scattering=6e-3, ground_albedo=0.0)
     found = fit(images, init=init, free=free, model=Toy())
     assert found.converged
-    assert [e.name for e in found.exposures] == ["exposure_sun 30", "exposure_lens"]
-    for estimate, factor in zip(found.exposures, (20.0, 0.05), strict=True):
+    assert [e.name for e in found.nuisances] == ["exposure_sun 30", "exposure_lens"]
+    for estimate, factor in zip(found.nuisances, (20.0, 0.05), strict=True):
         assert abs(estimate.value - factor) < 5 * estimate.standard_error
         assert estimate.standard_error < 0.01 * factor
 

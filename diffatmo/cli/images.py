@@ -22,6 +22,25 @@ if TYPE_CHECKING:
 NOISE_KEYS = ("noise", "noise_shot", "noise_floor")
 """Also looked for among the notes in an image's header."""
 
+NUMBERS_AND_NAMES = (
+    "exposure",
+    "white_balance",
+    "pedestal",
+    "sun_offset",
+    "pose",
+    "focal",
+    "focal_error",
+    "saturation",
+)
+ANGLES = (
+    "view_zenith_max_deg",
+    "sun_exclusion_deg",
+    "horizon_exclusion_deg",
+    "sun_offset_error_deg",
+    "pose_error_deg",
+)
+"""What :func:`fitting.observe` takes as it is, and what it takes in radians."""
+
 SAME_WAVELENGTH_NM = 0.01
 
 
@@ -48,14 +67,8 @@ def observe(spec: ImageSpec, name: str, init: "Atmosphere") -> Seen:
     try:
         pixels = in_order(image, init)
         camera = find_camera(options, pixels, shot)
-        chosen: dict[str, Any] = {
-            key: options[key] for key in ("exposure", "white_balance", "saturation") if key in options
-        }
-        chosen |= {
-            key.removesuffix("_deg"): math.radians(options[key])
-            for key in ("view_zenith_max_deg", "sun_exclusion_deg", "horizon_exclusion_deg")
-            if key in options
-        }
+        chosen: dict[str, Any] = {key: options[key] for key in NUMBERS_AND_NAMES if key in options}
+        chosen |= {key.removesuffix("_deg"): math.radians(options[key]) for key in ANGLES if key in options}
         notes = shot.notes if shot else {}
         chosen |= {key: options.get(key, notes.get(key)) for key in NOISE_KEYS if key in options or key in notes}
         observation = fitting.observe(

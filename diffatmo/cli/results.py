@@ -53,7 +53,7 @@ def _numbers(record: Mapping[str, Any]) -> dict[str, float | None]:
             if isinstance(values, list):
                 names = [f"{field}_{nm:g}" for nm in record["wavelengths_nm"]]
             else:
-                # An exposure of the image's own bears its name, and is the same column for all images.
+                # A nuisance of the image's own bears its name, and is the same column for all images.
                 own = group not in ("parameters", "derived")
                 names = [re.sub(rf"_{re.escape(image)}(?=_|$)", "", field, count=1) if own else field]
                 values, errors = [values], [errors]

@@ -32,6 +32,19 @@ IMAGE_KEYS: dict[str, Key] = {
         "fixed, free, free-per-channel, or the name of a group of images that share one.  [default: fixed]"
     ),
     "white_balance": Word("fixed, free, or the name of a group of images that share one.  [default: fixed]"),
+    "pedestal": Word(
+        "Black level in units of the image: fixed, free, free-per-channel, or the name of a group.  [default: fixed]"
+    ),
+    "sun_offset": Word(
+        "The sun may be off by two small angles: fixed, free, or the name of a group.  [default: fixed]"
+    ),
+    "sun_offset_error_deg": Number("Standard deviation of each of them.  [default: 0.5]", 0, 30, positive=True),
+    "pose": Word(
+        "The camera may be turned by a small rotation: fixed, free, or the name of a group.  [default: fixed]"
+    ),
+    "pose_error_deg": Number("Standard deviation of each of its angles.  [default: 2]", 0, 30, positive=True),
+    "focal": Word("The focal length may be off by a factor: fixed, free, or the name of a group.  [default: fixed]"),
+    "focal_error": Number("Standard deviation of its logarithm.  [default: 0.05]", 0, 1, positive=True),
     "noise": Number("Relative standard deviation per pixel and channel.  [default: 0.01]", 0, 10),
     "noise_shot": Number("Variance per unit of signal (photon noise).  [default: 0]", 0, 1e30),
     "noise_floor": Number("Standard deviation of a dark pixel (read noise).  [default: 1e-4 of the median]", 0, 1e30),

@@ -1,0 +1,117 @@
+"""Several observations in arrays of one shape, so that one program sees them all."""
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from diffatmo.camera import Camera
+from fitting._errors import FitError
+from fitting.nuisances import FOCAL, OFFSETS, POSE, SUN, Nuisances, displace, gather, rotate, sun_axes
+from fitting.observation import FIXED, Observation
+
+
+class Views(NamedTuple):
+    """Where the images are taken from, under which sun, and where their pixels look."""
+
+    altitude: Float[Array, " image"]
+    sun: Float[Array, "image 3"]
+    directions: Float[Array, "image pixel part 3"]
+
+
+class Batch(eqx.Module):
+    """Several observations in arrays of one shape; ``pixel`` runs over those shown, padded with unused ones."""
+
+    altitude: Float[Array, " image"]
+    sun: Float[Array, "image 3"]
+    directions: Float[Array, "image pixel part 3"]
+    """One direction for each pixel, or four that have the mean and the variance of those it is the mean of."""
+    measured: Float[Array, "image pixel w"]
+    used: Bool[Array, "image pixel"]
+    noise: Float[Array, "image pixel w"]
+    noise_shot: Float[Array, "image pixel w"]
+    noise_floor: Float[Array, "image pixel w"]
+    exposure_value: Float[Array, " image"]
+    nuisances: Nuisances
+    sun_axes: Float[Array, "image 2 3"]
+    cameras: tuple[Camera | None, ...]
+    """Those whose focal length is free; empty if none is."""
+
+    def exposure(self, linear: Float[Array, " k"]) -> Float[Array, "image 1 w"]:
+        """What radiance is multiplied by."""
+        return self.exposure_value[:, None, None] * self.nuisances.factor(linear)
+
+    def views(self, moved: Float[Array, "image moving"]) -> Views:
+        """The views of the images with their free offsets ``moved``."""
+        moving = self.nuisances.moving
+        if not moving:
+            return Views(self.altitude, self.sun, self.directions)
+        by = jnp.zeros((len(self.sun), len(OFFSETS)), moved.dtype).at[:, np.array(moving)].set(moved)
+        directions = self.directions
+        if FOCAL in moving:
+            zoomed = [
+                seen
+                if camera is None
+                else camera.zoomed(jnp.exp(log)).directions_at(*jnp.moveaxis(camera.pixels(seen), -1, 0))
+                for camera, seen, log in zip(self.cameras, directions, by[:, FOCAL], strict=True)
+            ]
+            directions = jnp.stack(zoomed)
+        return Views(
+            self.altitude, displace(self.sun, self.sun_axes, by[:, SUN]), rotate(directions, by[:, None, None, POSE])
+        )
+
+
+def stack(observations: Sequence[Observation], wavelengths: Sequence[float]) -> Batch:
+    """The observations as one batch; raises :class:`FitError` if they do not go together."""
+    if not observations:
+        raise FitError("no observation was given")
+    seen = Counter(observation.name for observation in observations)
+    for name, count in seen.items():
+        if count > 1:
+            raise FitError(f"{name}: the name of {count} observations, expected different names")
+    for observation in observations:
+        channels = observation.image.shape[-1]
+        if channels != len(wavelengths):
+            given = ", ".join(f"{nm:g}" for nm in wavelengths)
+            raise FitError(
+                f"{observation.name}: the image has {channels} channels, expected {len(wavelengths)}, one for each "
+                f"wavelength of the atmosphere ({given} nm)"
+            )
+    size = max(int(observation.shown.sum()) for observation in observations)
+
+    def padded(field: str, fill: Any) -> Array:
+        rows = []
+        for observation in observations:
+            value = getattr(observation, field)[observation.shown]
+            rows.append(np.concatenate([value, np.broadcast_to(fill, (size - len(value), *value.shape[1:]))]))
+        return number(np.stack(rows))
+
+    def number(value: Any) -> Array:
+        array = np.asarray(value)
+        return jnp.asarray(array, dtype=bool if array.dtype == bool else jnp.result_type(float))
+
+    directions = padded("directions", np.array([0, 0, 1], dtype=np.float32))[..., None, :]
+    if any(observation.block > 1 for observation in observations):
+        first, second = jnp.moveaxis(padded("spread", np.float32(0)), -2, 0)[..., None, :]
+        signs = jnp.asarray([[1, 1], [1, -1], [-1, 1], [-1, -1]], first.dtype)[..., None]
+        directions = directions + signs[:, 0] * first + signs[:, 1] * second
+        directions = directions / jnp.linalg.norm(directions, axis=-1, keepdims=True)
+    cameras = tuple(None if observation.focal == FIXED else observation.camera for observation in observations)
+    return Batch(
+        altitude=number([observation.altitude for observation in observations]),
+        sun=number(np.stack([observation.sun for observation in observations])),
+        directions=directions,
+        measured=jnp.nan_to_num(padded("image", np.float32(0)), posinf=0.0, neginf=0.0),
+        used=padded("used", False),
+        noise=padded("noise", np.float32(0)),
+        noise_shot=padded("noise_shot", np.float32(0)),
+        noise_floor=padded("noise_floor", np.float32(1)),
+        exposure_value=number([observation.exposure_value for observation in observations]),
+        nuisances=gather(observations, wavelengths)[1],
+        sun_axes=number(np.stack([sun_axes(observation.sun) for observation in observations])),
+        cameras=cameras if any(cameras) else (),
+    )

@@ -1,0 +1,244 @@
+"""What an image depends on besides the air, and is not known well enough: numbers that are fitted along with it.
+
+==================  =====================================================  ==========================================  ======
+kind                numbers                                                enters                                      known
+==================  =====================================================  ==========================================  ======
+``exposure``        a factor, or one for each channel                      light = value × factor × radiance           no
+``white_balance``   a factor for each channel but the middle one           the same                                    no
+``pedestal``        a number, or one for each channel, in image units      pixel = light + pedestal                    no
+``sun_offset``      two angles in the tangent plane of the sun             the sun                                     0 ± 0.5°
+``pose``            three components of a rotation vector                  the directions of the pixels                0 ± 2°
+``focal``           the logarithm of a factor                              the directions, by the camera's projection  0 ± 5 %
+==================  =====================================================  ==========================================  ======
+
+Each is fixed, free for an image of its own, or shared by a named group of images.
+
+The first three are *linear*: given the radiance, their optimum follows (:mod:`fitting.elimination`). The others are *offsets*:
+they move the view of a sky that is solved once. An offset touches one image, or those of its group, and images do not mix; so
+the six components of :data:`OFFSETS` need six tangents at most, whatever the number of images.
+
+Rotation vector and tangent plane are smooth where angles are not: at no rotation, and with the sun at the zenith.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from diffatmo._types import Direction
+from diffatmo.numerics import safe_norm
+from fitting._errors import FitError
+from fitting.observation import FIXED, FREE, PER_CHANNEL, Observation
+
+OFFSETS = (
+    ("sun_offset", "zenith_deg"),
+    ("sun_offset", "azimuth_deg"),
+    ("pose", "east_deg"),
+    ("pose", "north_deg"),
+    ("pose", "up_deg"),
+    ("focal", ""),
+)
+"""Kind and component of all that moves the view of an image."""
+
+SUN, POSE, FOCAL = slice(0, 2), slice(2, 5), 5
+"""Their places among the offsets of an image."""
+
+KINDS = ("exposure", "white_balance", "pedestal", "sun_offset", "pose", "focal")
+
+
+class Label(NamedTuple):
+    """What a nuisance is called, and the unit it is reported in."""
+
+    name: str
+    unit: str = ""
+
+
+class Nuisances(eqx.Module):
+    """The nuisances of a batch of images: first ``offsets`` coordinates, then ``linear`` ones.
+
+    An offset is in units of what is known of it beforehand, ``unit``; factors are logarithms. -1 stands for what is fixed.
+    """
+
+    moving: tuple[int, ...] = eqx.field(static=True)
+    """Which of :data:`OFFSETS` are free in any image."""
+    offset_index: Int[Array, "image moving"]
+    unit: Float[Array, " m"]
+    """rad, or of a logarithm."""
+    angle: Bool[Array, " m"]
+    factor_index: Int[Array, "image w 2"]
+    """Numbers of the factors of exposure and of white balance."""
+    pedestal_index: Int[Array, "image w"]
+    factors: int = eqx.field(static=True)
+    pedestals: int = eqx.field(static=True)
+
+    @property
+    def offsets(self) -> int:
+        """Number of offsets."""
+        return self.unit.size
+
+    @property
+    def linear(self) -> int:
+        """Number of factors and pedestals."""
+        return self.factors + self.pedestals
+
+    @property
+    def size(self) -> int:
+        """Number of coordinates."""
+        return self.offsets + self.linear
+
+    def factor(self, linear: Float[Array, " k"]) -> Float[Array, "image 1 w"]:
+        """The product of the free factors of each image and channel."""
+        logs = jnp.append(linear[: self.factors], 0)
+        return jnp.exp(jnp.sum(logs[self.factor_index], axis=-1))[:, None]
+
+    def pedestal(self, linear: Float[Array, " k"]) -> Float[Array, "image 1 w"]:
+        """What is added to the light of each image and channel."""
+        return jnp.append(linear[self.factors :], 0)[self.pedestal_index][:, None]
+
+    def moved(self, offsets: Float[Array, " m"]) -> Float[Array, "image moving"]:
+        """The free components of each image, rad or the logarithm of a factor."""
+        return jnp.append(offsets * self.unit, 0)[self.offset_index]
+
+    def values(self, coordinates: Float[Array, " m+k"]) -> Float[Array, " m+k"]:
+        """The numbers that are reported: degrees, factors, and units of the image."""
+        offsets, linear = coordinates[: self.offsets] * self.unit, coordinates[self.offsets :]
+        reported = jnp.where(self.angle, offsets * (180 / math.pi), jnp.exp(jnp.where(self.angle, 0, offsets)))
+        return jnp.concatenate([reported, jnp.exp(linear[: self.factors]), linear[self.factors :]])
+
+
+def group_of(observation: Observation, kind: str) -> str | None:
+    """The image or the group that a nuisance of this kind belongs to; None if it is fixed."""
+    choice: str = getattr(observation, kind)
+    if choice == FIXED:
+        return None
+    group = choice.removesuffix(PER_CHANNEL)
+    return observation.name if group == FREE else group
+
+
+def channel_names(observation: Observation, kind: str, wavelengths: Sequence[float]) -> list[str | None]:
+    """For each channel the name of its exposure, white balance or pedestal; None where that is fixed."""
+    group = group_of(observation, kind)
+    if group is None:
+        return [None] * len(wavelengths)
+    names: list[str | None] = [f"{kind}_{group}_{nm:g}" for nm in wavelengths]
+    if kind == "white_balance":
+        names[int(np.argsort(wavelengths)[(len(wavelengths) - 1) // 2])] = None
+    elif not getattr(observation, kind).endswith(PER_CHANNEL):
+        names = [f"{kind}_{group}"] * len(wavelengths)
+    return names
+
+
+def gather(observations: Sequence[Observation], wavelengths: Sequence[float]) -> tuple[list[Label], Nuisances]:
+    """The nuisances of these images, and what they are called; raises :class:`FitError` for groups that cannot be."""
+    for kind in KINDS:
+        _check_groups(observations, kind)
+    offsets, units = _Numbers(), list[float]()
+    of_offsets = np.full((len(observations), len(OFFSETS)), -1)
+    for image, observation in enumerate(observations):
+        for column, (kind, component) in enumerate(OFFSETS):
+            if (group := group_of(observation, kind)) is None:
+                continue
+            of_offsets[image, column] = offsets.number(f"{kind}_{group}" + f"_{component}" * bool(component))
+            error = getattr(observation, f"{kind}_error")
+            units[len(units) :] = [error] * (len(offsets) - len(units))
+            if units[of_offsets[image, column]] != error:
+                raise FitError(
+                    f"{observation.name}: {kind}_error: got {error:g}, another image of {group!r} has another"
+                )
+    factors, pedestals = _Numbers(), _Numbers()
+    of_factors = np.stack(
+        [
+            [[factors.number(name) for name in channel_names(o, kind, wavelengths)] for o in observations]
+            for kind in ("exposure", "white_balance")
+        ],
+        axis=-1,
+    )
+    of_pedestals = np.array(
+        [[pedestals.number(name) for name in channel_names(o, "pedestal", wavelengths)] for o in observations]
+    )
+    moving = np.flatnonzero((of_offsets >= 0).any(axis=0))
+    angle = [name.endswith("_deg") and not name.startswith("focal_") for name in offsets]
+    labels = [Label(name, "deg" if is_angle else "") for name, is_angle in zip(offsets, angle, strict=True)]
+    return [*labels, *map(Label, [*factors, *pedestals])], Nuisances(
+        moving=tuple(int(component) for component in moving),
+        offset_index=jnp.asarray(of_offsets[:, moving]),
+        unit=jnp.asarray(units, jnp.result_type(float)),
+        angle=jnp.asarray(angle, bool),
+        factor_index=jnp.asarray(of_factors),
+        pedestal_index=jnp.asarray(of_pedestals),
+        factors=len(factors),
+        pedestals=len(pedestals),
+    )
+
+
+class _Numbers(dict[str, int]):
+    """Names in the order in which they are first asked for, each with its number."""
+
+    def number(self, name: str | None) -> int:
+        """That of ``name``; -1 for none."""
+        return -1 if name is None else self.setdefault(name, len(self))
+
+
+def _check_groups(observations: Sequence[Observation], kind: str) -> None:
+    """Refuse an image with a nuisance of its own whose name is that of a group, which would then share it."""
+    choices = [getattr(observation, kind).removesuffix(PER_CHANNEL) for observation in observations]
+    own = {observation.name for observation, choice in zip(observations, choices, strict=True) if choice == FREE}
+    if both := own & set(choices):
+        raise FitError(f"{both.pop()}: an image with a free {kind} has the name of a group; rename the group")
+
+
+def assumed(observations: Sequence[Observation]) -> list[tuple[str, float, float, bool, str]]:
+    """What is known of the offsets beforehand: name, value, error, whether it is one of the logarithm, and whose.
+
+    In the units of :meth:`Nuisances.values`.
+    """
+    found: dict[tuple[str, float, float, bool, str], None] = {}
+    for observation in observations:
+        for kind, unit in (("sun_offset", "_deg"), ("pose", "_deg"), ("focal", "")):
+            if group_of(observation, kind) is not None:
+                error = getattr(observation, f"{kind}_error")
+                in_degrees = bool(unit)
+                found[
+                    kind + unit,
+                    float(not in_degrees),
+                    math.degrees(error) if in_degrees else error,
+                    not in_degrees,
+                    "each",
+                ] = None
+    return list(found)
+
+
+# The geometry -------------------------------------------------------------------------------------------------------
+
+
+def rotate(vectors: Direction, by: Float[Array, "... 3"]) -> Direction:
+    """``vectors`` turned about the axis ``by`` through the angle |``by``|, by the right-hand rule (Rodrigues 1840)."""
+    angle = safe_norm(by)[..., None]
+    along = jnp.sum(by * vectors, axis=-1, keepdims=True)
+    # sin θ / θ and (1 - cos θ) / θ², smooth through θ = 0.
+    sine, versine = jnp.sinc(angle / np.pi), jnp.sinc(angle / (2 * np.pi)) ** 2 / 2
+    return vectors * jnp.cos(angle) + jnp.cross(by, vectors) * sine + by * along * versine
+
+
+def sun_axes(sun: Float[np.ndarray, "3"]) -> Float[np.ndarray, "2 3"]:
+    """Unit vectors in the tangent plane of the sun: to larger zenith angles, and clockwise along its horizon circle.
+
+    A sun at the zenith has the azimuth 0.
+    """
+    east, north, up = sun
+    level = math.hypot(east, north)
+    sine, cosine = (east / level, north / level) if level > 0 else (0.0, 1.0)
+    return np.array([[sine * up, cosine * up, -level], [cosine, -sine, 0.0]])
+
+
+def displace(
+    sun: Float[Array, "... 3"], axes: Float[Array, "... 2 3"], by: Float[Array, "... 2"]
+) -> Float[Array, "... 3"]:
+    """The sun at the end of the great circle that leaves it along ``axes`` · ``by``, |``by``| rad long."""
+    angle = safe_norm(by)[..., None]
+    along = axes[..., 0, :] * by[..., :1] + axes[..., 1, :] * by[..., 1:]
+    return sun * jnp.cos(angle) + along * jnp.sinc(angle / np.pi)
