@@ -50,6 +50,14 @@ class Estimate:
 
 
 @dataclass(frozen=True)
+class Minimum:
+    """One of several minima: its numbers, and its χ²."""
+
+    values: dict[str, float]
+    chi2: float
+
+
+@dataclass(frozen=True)
 class Findings:
     """What a fit found. Arrays are NumPy's; ``covariance`` belongs to the numbers named in ``covariance_names``.
 
@@ -77,6 +85,8 @@ class Findings:
     priors: list[Prior] = field(default_factory=list)
     outliers: list[int] = field(default_factory=list)
     """Pixels of each image to which a robust loss gave less than half their weight."""
+    minima: list[Minimum] = field(default_factory=list)
+    """The distinct minima that were found, if there are several: the best first, all before any correction by a finer model."""
     model: Model | None = None
     refine: bool = True
 

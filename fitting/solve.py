@@ -13,6 +13,9 @@ a natural unit of the coordinates, and parameters held by their bounds, do not c
 *Resolution.* The steps are those of the model as it is given. A model that knows a ``finer`` one of itself is then compared
 with it at the optimum, and the last pass explains the images by the finer model there, with the slopes of the first.
 
+*Starts.* A search that has gone astray, which its χ² shows, is begun anew from the best atmospheres of a coarse grid
+(:mod:`fitting.starts`).
+
 *Noise.* sigma depends on the expected signal, which is known only after the fit. Taken from the noisy pixels it
 favours those that came out dark, and biases the radiance by about -2 (relative noise)²: 2e-4 for 1 % noise, ten
 standard errors of a well-determined parameter. So the fit starts with sigma from the measured signal, and goes on with that
@@ -22,9 +25,10 @@ from the fitted one.
 import math
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -58,6 +62,7 @@ from fitting.residuals import (
     whitened,
 )
 from fitting.robust import Loss, scale
+from fitting.starts import APART, RIVAL, ranked, separation
 
 TOLERANCE = 0.1
 """Distance to the optimum, in standard errors, at which the fit has converged."""
@@ -90,6 +95,15 @@ LARGEST_DEVIATION = 0.03
 LARGEST_MISFIT = 100.0
 """Reduced χ² up to which residuals are taken for noise that may hide an optimum; beyond it the model is wrong somewhere."""
 
+ASTRAY = 10.0
+"""Reduced χ² beyond which the search from the given start is not trusted to have found the best minimum."""
+
+PATIENCE = 40
+"""Steps after which a search with such a χ² is given up for others."""
+
+OTHERS = 3
+"""Starts that are tried then, at most."""
+
 HOPELESS_MISFIT = 1e4
 """Reduced χ² of images that have nothing to do with the model: another unit, another exposure."""
 
@@ -113,6 +127,7 @@ OUT_OF_STEPS = "stopped: not converged in the steps allowed"
 UNLIKE = (
     "the images are not of such a sky: residuals are {:.0f} times the noise; are exposure, units, camera and sun right?"
 )
+ELSEWHERE = "{}; from one of {} other starts, as the one given leads to a χ² {:.2g} times as large"
 TOO_COARSE = "converged, but the model's finer self differs from it by {:.0%}: the error bars do not hold"
 
 # The test for convergence is made here, so optimistix's own is set out of reach. Its trust region trusts a step only if
@@ -172,6 +187,8 @@ class Solution(NamedTuple):
     """What a robust loss makes of the covariance (:meth:`fitting.robust.Loss.inflation`)."""
     outliers: list[int]
     """Pixels of each image to which a robust loss gives less than half their weight."""
+    minima: list[tuple[Coordinates, float]]
+    """Coordinates and χ² of the minima, the best first, if there are several; before any correction by a finer model."""
 
     @property
     def chi2(self) -> float:
@@ -298,11 +315,14 @@ def _minimise(
     progress: Progress | None,
     keep: Callable[[Coordinates, float], None],
     step_size: float | None = None,
+    patience: int | None = None,
 ) -> _Point:
     """Levenberg-Marquardt from ``y``, where the model is linearised already, until ``history`` holds ``max_steps``.
 
     ``keep`` is given the best point and the step size after every step; ``step_size`` is that of the first one.
+    After ``patience`` steps a search that has still gone astray ends.
     """
+    begun = len(history)
     state = outermost(_start)(y)
     limits = jax.tree.map(np.asarray, problem.limits)
     freedom = max(_count(problem.batch) - y.size, 1)
@@ -359,11 +379,40 @@ def _minimise(
             end = _end(best.distance, rejections, tolerance)
             if end is not None:
                 return best._replace(converged=end[0], message=end[1])
+            if patience is not None and len(history) - begun >= patience and best.chi2 > ASTRAY * freedom:
+                break
     except KeyboardInterrupt:
         if best is None:
             raise
         return best._replace(message=INTERRUPTED)
     return best
+
+
+def _elsewhere(
+    problem: Problem,
+    search: Callable[[Coordinates, Linearisation, Problem], _Point],
+    evaluate: Callable[[Coordinates, Problem], Linearisation],
+) -> Iterator[_Point]:
+    """Where searches from other starts end, the most promising first."""
+    dtype = problem.parameters.start.dtype
+    for point in ranked(problem, _starting_exposures):
+        start = evaluate(jnp.asarray(point, dtype), problem)
+        y = jnp.asarray(np.append(point, _starting_exposures(np.asarray(start.radiance), problem.batch)), dtype)
+        if np.isfinite(np.asarray(start.tangents)[np.asarray(problem.batch.used)]).all():
+            yield search(y, start, _rescaled(y, start, problem))
+
+
+def _distinct(points: Sequence[_Point], problem: Problem) -> list[_Point]:
+    """The best of ``points``, then every other minimum that is a rival of it. An interrupted search interrupts the best."""
+    best, *others = sorted(points, key=lambda point: point.chi2)
+    kept, misfit = [best], best.chi2 / max(_count(problem.batch) - best.y.size, 1)
+    for point in others:
+        apart = [separation(np.asarray(point.y), np.asarray(o.y), (point.triangle, o.triangle), misfit) for o in kept]
+        if point.converged and point.chi2 < RIVAL * best.chi2 and min(apart) > APART:
+            kept.append(point)
+    if any(point.message == INTERRUPTED for point in points):
+        kept[0] = best._replace(converged=False, message=INTERRUPTED)
+    return kept
 
 
 def _shares(best: _Point, problem: Problem) -> dict[str, Any]:
@@ -468,6 +517,7 @@ def solve(
     max_steps: int = MAX_STEPS,
     tolerance: float = TOLERANCE,
     refine: bool = True,
+    starts: int | None = None,
     checkpoint: Path | None = None,
 ) -> Solution:
     """Find the atmosphere that explains ``observations``; see :func:`fitting.fit`, which adds the error bars.
@@ -477,6 +527,8 @@ def solve(
     """
     if max_steps < 1:
         raise FitError(f"max_steps: got {max_steps}, expected at least 1")
+    if starts is not None and starts < 1:
+        raise FitError(f"starts: got {starts}, expected at least 1")
     if not tolerance > 0:
         raise FitError(f"tolerance: got {tolerance}, expected a number > 0")
     started = time.perf_counter()
@@ -535,15 +587,37 @@ def solve(
                 checkpoint = None
 
     search = partial(_minimise, evaluate=evaluate, max_steps=max_steps, history=history, progress=progress, keep=keep)
+    # A broken-off fit goes on from the best point, not from one that was only tried.
+    aside = partial(search, keep=lambda *_: None)
     rough = max(tolerance, FIRST_PASS_TOLERANCE)
     # A search that goes on has the step size that it had, any other begins with its own.
     step_size = None if saved is None else saved.step_size
     y, scales = jnp.concatenate([coordinates, jnp.asarray(log_factors, coordinates.dtype)]), [math.inf]
-    interrupted = False
+    interrupted, tried, first, rivals = False, 0, math.nan, list[_Point]()
+    astray = ASTRAY * max(_count(batch) - size, 1)
     while not final:
         problem = _rescaled(y, start, problem)
-        best = search(y, start, problem, tolerance=rough, step_size=step_size)
+        patience = PATIENCE if starts is None and not tried else None
+        best = search(y, start, problem, tolerance=rough, step_size=step_size, patience=patience)
         step_size = None
+        wanted = 0 if tried else starts - 1 if starts is not None else OTHERS * (best.chi2 > astray)
+        if wanted and best.message != INTERRUPTED and len(history) < max_steps:
+            points, first = [best], best.chi2
+            more = _elsewhere(
+                problem, partial(aside, tolerance=rough, max_steps=len(history) + wanted * max_steps), evaluate
+            )
+            try:
+                for point in islice(more, wanted):
+                    points.append(point)
+                    # What was only sought because the first search had gone astray has been found.
+                    if point.message == INTERRUPTED or (starts is None and point.converged and point.chi2 < astray):
+                        break
+            except KeyboardInterrupt:
+                points[0] = best._replace(converged=False, message=INTERRUPTED)
+            tried = len(points) - 1
+            best, *rivals = _distinct(points, problem)
+            search, aside = (partial(each, max_steps=len(history) + max_steps) for each in (search, aside))
+        y, start = best.y, best.linearisation
         y, start = best.y, best.linearisation
         interrupted = best.message == INTERRUPTED
         if interrupted or problem.loss is None:
@@ -557,6 +631,10 @@ def solve(
         problem = outermost(_weigh)(problem, outermost(_expected)(y, start, problem))
         problem = _rescaled(y, start, problem)
         best = search(y, start, problem, tolerance=tolerance, step_size=step_size)
+        if best.message != INTERRUPTED:
+            others = [aside(other.y, other.linearisation, problem, tolerance=tolerance) for other in rivals]
+            best, *rivals = _distinct([best, *others], problem)
+    minima = [(point.y, point.chi2) for point in (best, *rivals)] if rivals else []
     model_error = np.zeros((size, size))
     if finer is not None and best.converged:
         coordinates, radiance = best.y[: parameters.size], best.linearisation.radiance
@@ -575,6 +653,8 @@ def solve(
     misfit = float(np.sum(best.triangle[:, -1] ** 2)) / max(_count(batch) - size, 1)
     if best.converged and misfit > HOPELESS_MISFIT:
         best = best._replace(converged=False, message=UNLIKE.format(math.sqrt(misfit)))
+    if best.converged and first > RIVAL * best.chi2:
+        best = best._replace(message=ELSEWHERE.format(best.message, tried, first / best.chi2))
     total = time.perf_counter() - started
     # What a typical evaluation does not explain is compilation and preparation, which happen once.
     evaluations = min(total, len(seconds) * float(np.median(seconds)))
@@ -590,6 +670,7 @@ def solve(
         residual_count=_count(batch),
         converged=best.converged,
         message=best.message,
+        minima=minima,
         timings={"compile_s": total - evaluations, "solve_s": evaluations, "total_s": total},
         **_shares(best, problem),
     )

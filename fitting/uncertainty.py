@@ -29,7 +29,7 @@ from jaxtyping import Array, Float
 from diffatmo.atmosphere import Atmosphere
 from diffatmo.compiling import outermost
 from diffatmo.models import Model, Moments
-from fitting.findings import Estimate
+from fitting.findings import Estimate, Minimum
 from fitting.observation import Observation, unstack
 from fitting.parameters import Coordinates, Parameters
 from fitting.priors import Prior
@@ -159,10 +159,26 @@ def summarise(
         fitted=[unstack(o, image) for o, image in zip(observations, solution.predicted, strict=True)],
         priors=list(priors),
         outliers=solution.outliers,
+        minima=_minima(solution),
         undetermined=[e.name for e in [*estimates, *factors] if e.standard_error is None],
         model=model,
         refine=refine,
     )
+
+
+def _minima(solution: Solution) -> list[Minimum]:
+    """The minima of the solution in the numbers that are reported."""
+    parameters = solution.parameters
+    names = [
+        q.name
+        for q in quantities([*parameters.fields, *parameters.derived], np.asarray(parameters.init.wavelengths).tolist())
+    ]
+    return [
+        Minimum(
+            dict(zip(names, np.asarray(outermost(_physical)(y, parameters)[0], float).tolist(), strict=False)), chi2
+        )
+        for y, chi2 in solution.minima
+    ]
 
 
 def fit(
@@ -178,6 +194,7 @@ def fit(
     max_steps: int = MAX_STEPS,
     tolerance: float = TOLERANCE,
     refine: bool = True,
+    starts: int | None = None,
     checkpoint: Path | None = None,
 ) -> FitResult:
     """Recover an atmosphere's parameters from images of its sky, with error bars.
@@ -195,10 +212,13 @@ def fit(
             (:mod:`fitting.robust`).
         model: How the sky is computed, :class:`~diffatmo.models.moments.Moments` by default.
         progress: Called after each step.
-        max_steps: Evaluations of the model with its derivatives before the fit gives up.
+        max_steps: Evaluations of the model with its derivatives before the fit gives up; each further start has as many.
         tolerance: Distance to the optimum, in standard errors, at which it is found.
         refine: Whether the last steps explain the images by the model's ``finer`` self, if it has one, and the error bars
             take in what that may leave of the model's error. False fits images that ``model`` itself has made.
+        starts: From how many starts to search: that of ``init``, and the best of a coarse grid about it
+            (:mod:`fitting.starts`). None is one, and up to three more if its search ends at a reduced χ² above 10 or is still
+            there after 40 steps. Several distinct minima, if there are, are in ``minima``.
         checkpoint: A file that holds the best point after every step, and from which the same fit goes on if it exists. It
             is left for the caller to remove.
 
@@ -222,6 +242,7 @@ def fit(
         max_steps=max_steps,
         tolerance=tolerance,
         refine=refine,
+        starts=starts,
         checkpoint=checkpoint,
     )
     return summarise(solution, observations, model, priors=priors, refine=refine)

@@ -42,6 +42,7 @@ LEVELS = [
     ["fitting.parameters", "fitting.observation"],
     ["fitting.priors", "fitting.robust", "fitting.checkpoint"],
     ["fitting.residuals"],
+    ["fitting.starts"],
     ["fitting.solve"],
     ["fitting.findings"],
     ["fitting.combinations"],
