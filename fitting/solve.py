@@ -224,7 +224,7 @@ def _deviation(problem: Problem) -> Float[np.ndarray, "image w"]:
     return np.sqrt((deviation**2).sum(axis=1) / np.maximum(used.sum(axis=1), 1)[:, None])
 
 
-def _model_error(best: "_Point", problem: Problem) -> Float[np.ndarray, "n n"]:
+def _model_error(best: "Point", problem: Problem) -> Float[np.ndarray, "n n"]:
     """Covariance of the coordinates from what the correction leaves of the model's error.
 
     The finer model is taken to be off by :data:`REMAINING` of what the coarser one was off: in every image by a smooth random
@@ -291,7 +291,7 @@ def _shorten(y: Coordinates, trial: Coordinates, limits: tuple[np.ndarray, np.nd
     return jnp.clip(y + (trial - y) * jnp.minimum(1, LONGEST_STEP / jnp.where(largest > 0, largest, 1)), *limits)
 
 
-class _Point(NamedTuple):
+class Point(NamedTuple):
     """A point of the search, and why the search ended if it ended there."""
 
     y: Coordinates
@@ -303,7 +303,7 @@ class _Point(NamedTuple):
     message: str = OUT_OF_STEPS
 
 
-def _minimise(
+def minimise(
     y: Coordinates,
     start: Linearisation,
     problem: Problem,
@@ -316,7 +316,7 @@ def _minimise(
     keep: Callable[[Coordinates, float], None],
     step_size: float | None = None,
     patience: int | None = None,
-) -> _Point:
+) -> Point:
     """Levenberg-Marquardt from ``y``, where the model is linearised already, until ``history`` holds ``max_steps``.
 
     ``keep`` is given the best point and the step size after every step; ``step_size`` is that of the first one.
@@ -327,7 +327,7 @@ def _minimise(
     limits = jax.tree.map(np.asarray, problem.limits)
     freedom = max(_count(problem.batch) - y.size, 1)
     stage = history[-1].stage + 1 if history else 1
-    best: _Point | None = None
+    best: Point | None = None
     misfit, scale, rejections = 1.0, 1.0, 0
     try:
         while best is None or len(history) < max_steps:
@@ -356,7 +356,7 @@ def _minimise(
             y, state = outermost(_step)(y, state, (plane[:, -1], plane[:, :-1], trial))
             accepted = best is None or (finite and np.array_equal(y, trial))
             if best is None or accepted:
-                best = _Point(y, linearisation, factor, chi2, distance(held, misfit))
+                best = Point(y, linearisation, factor, chi2, distance(held, misfit))
             rejections = 0 if accepted else rejections + 1
             history.append(
                 Step(
@@ -390,9 +390,9 @@ def _minimise(
 
 def _elsewhere(
     problem: Problem,
-    search: Callable[[Coordinates, Linearisation, Problem], _Point],
+    search: Callable[[Coordinates, Linearisation, Problem], Point],
     evaluate: Callable[[Coordinates, Problem], Linearisation],
-) -> Iterator[_Point]:
+) -> Iterator[Point]:
     """Where searches from other starts end, the most promising first."""
     dtype = problem.parameters.start.dtype
     for point in ranked(problem, _starting_exposures):
@@ -402,7 +402,7 @@ def _elsewhere(
             yield search(y, start, _rescaled(y, start, problem))
 
 
-def _distinct(points: Sequence[_Point], problem: Problem) -> list[_Point]:
+def _distinct(points: Sequence[Point], problem: Problem) -> list[Point]:
     """The best of ``points``, then every other minimum that is a rival of it. An interrupted search interrupts the best."""
     best, *others = sorted(points, key=lambda point: point.chi2)
     kept, misfit = [best], best.chi2 / max(_count(problem.batch) - best.y.size, 1)
@@ -415,7 +415,7 @@ def _distinct(points: Sequence[_Point], problem: Problem) -> list[_Point]:
     return kept
 
 
-def _shares(best: _Point, problem: Problem) -> dict[str, Any]:
+def _shares(best: Point, problem: Problem) -> dict[str, Any]:
     """What the images and what the priors contribute, and what a robust loss does."""
     shares: dict[str, Any] = {
         "of_images": best.triangle,
@@ -504,6 +504,31 @@ def _starting_exposures(radiance: np.ndarray, batch: Batch) -> Float[np.ndarray,
     return np.array([np.log(np.median(values)) if values.size else 0.0 for values in chosen])
 
 
+def restored(
+    observations: Sequence[Observation],
+    parameters: Parameters,
+    y: Coordinates,
+    *,
+    priors: Sequence[Prior],
+    loss: str | None,
+    model: Model,
+    refine: bool,
+) -> tuple[Problem, Linearisation]:
+    """The problem of which ``y`` is the solution, with noise, correction and scale of the loss as they are there."""
+    batch = stack(observations, [float(nm) for nm in parameters.init.wavelengths])
+    signal, shell = batch.measured, outermost(planet_shell)(model, parameters)
+    problem = Problem(model, parameters, batch, signal, shell, jnp.ones_like(signal), collect(priors, parameters))
+    if loss is not None:
+        problem = replace(problem, loss=Loss(loss, jnp.ones((), signal.dtype)))
+    start = outermost(linearise)(y[: parameters.size], problem)
+    if refine and (finer := model.finer()) is not None:
+        correction = outermost(_correction)(y[: parameters.size], problem, start.radiance, finer)
+        problem = replace(problem, correction=correction)
+        start = Linearisation(start.radiance * correction, start.tangents * correction[..., None])
+    problem = outermost(_weigh)(problem, outermost(_expected)(y, start, problem))
+    return _rescaled(y, start, problem), start
+
+
 def solve(
     observations: Sequence[Observation],
     *,
@@ -586,14 +611,14 @@ def solve(
                 warnings.warn(f"{error}; the fit goes on without a checkpoint", stacklevel=2)
                 checkpoint = None
 
-    search = partial(_minimise, evaluate=evaluate, max_steps=max_steps, history=history, progress=progress, keep=keep)
+    search = partial(minimise, evaluate=evaluate, max_steps=max_steps, history=history, progress=progress, keep=keep)
     # A broken-off fit goes on from the best point, not from one that was only tried.
     aside = partial(search, keep=lambda *_: None)
     rough = max(tolerance, FIRST_PASS_TOLERANCE)
     # A search that goes on has the step size that it had, any other begins with its own.
     step_size = None if saved is None else saved.step_size
     y, scales = jnp.concatenate([coordinates, jnp.asarray(log_factors, coordinates.dtype)]), [math.inf]
-    interrupted, tried, first, rivals = False, 0, math.nan, list[_Point]()
+    interrupted, tried, first, rivals = False, 0, math.nan, list[Point]()
     astray = ASTRAY * max(_count(batch) - size, 1)
     while not final:
         problem = _rescaled(y, start, problem)

@@ -1,8 +1,8 @@
 """Where else a search could begin: a coarse grid about the given start, held against the images.
 
-From a start that is wrong by a factor of ten in the optical depth of the aerosol, the first steps of Levenberg-Marquardt may lead
-to an atmosphere of a thousand kilometres, where no derivative leads back. So the numbers whose start is anybody's guess are
-tried at three values each: the aerosol's coefficients at a fifth of the start and five times it, scale heights at half and twice,
+From a start that is wrong by a factor of ten in the optical depth of the aerosol, the first steps of Levenberg-Marquardt may
+lead to an atmosphere of a thousand kilometres, where no derivative leads back. So the numbers that a start may have wrong are
+tried at three values each: the aerosol's coefficients at a fifth and five times the start, scale heights at half and twice,
 g 0.3 below and above. A grid of at most 81 atmospheres, of which a few hundred pixels are computed in one compiled program.
 
 They are ranked by how far ln(expected / measured) is off, in units of the noise: unlike χ² it does not favour atmospheres that

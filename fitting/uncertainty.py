@@ -29,7 +29,7 @@ from jaxtyping import Array, Float
 from diffatmo.atmosphere import Atmosphere
 from diffatmo.compiling import outermost
 from diffatmo.models import Model, Moments
-from fitting.findings import Estimate, Minimum
+from fitting.findings import Estimate, Minimum, Setup
 from fitting.observation import Observation, unstack
 from fitting.parameters import Coordinates, Parameters
 from fitting.priors import Prior
@@ -99,13 +99,16 @@ def summarise(
     *,
     priors: Sequence[Prior] = (),
     refine: bool,
+    free: Sequence[str] = (),
+    tie: Mapping[str, str] | None = None,
+    loss: str | None = None,
 ) -> FitResult:
     """Attach error bars to ``solution``, which was found with ``model``, and its finer self if ``refine``."""
     parameters = solution.parameters
     count = parameters.size
     wavelengths = [float(nm) for nm in parameters.init.wavelengths]
-    free, derived = parameters.fields, parameters.derived
-    fitted_quantities = quantities(free, wavelengths)
+    fields, derived = parameters.fields, parameters.derived
+    fitted_quantities = quantities(fields, wavelengths)
     all_quantities = fitted_quantities + quantities(derived, wavelengths)
 
     slopes, (numbers_found, atmosphere) = outermost(_slopes)(solution.y, parameters)
@@ -119,7 +122,7 @@ def summarise(
     shares = data_shares(of_images, factor, gradient)
     covariance = covariance + gradient @ solution.model_error @ gradient.T
     errors = [math.sqrt(v) if ok else None for v, ok in zip(np.diag(covariance), determined, strict=True)]
-    initial = np.asarray(numbers(parameters.atmosphere(parameters.start), free + derived), dtype=float)
+    initial = np.asarray(numbers(parameters.atmosphere(parameters.start), fields + derived), dtype=float)
     at_bound = parameters.at_bound(np.asarray(solution.y)[:count])
 
     estimates = [
@@ -160,6 +163,7 @@ def summarise(
         priors=list(priors),
         outliers=solution.outliers,
         minima=_minima(solution),
+        setup=Setup(parameters.init, list(free), dict(tie or {}), loss, np.asarray(solution.y)),
         undetermined=[e.name for e in [*estimates, *factors] if e.standard_error is None],
         model=model,
         refine=refine,
@@ -245,4 +249,4 @@ def fit(
         starts=starts,
         checkpoint=checkpoint,
     )
-    return summarise(solution, observations, model, priors=priors, refine=refine)
+    return summarise(solution, observations, model, priors=priors, refine=refine, free=free, tie=tie, loss=loss)

@@ -49,7 +49,7 @@ LEVELS = [
     ["fitting.tables", "fitting.figures", "fitting.prediction", "fitting.storage"],
     ["fitting.report", "fitting.result"],
     ["fitting.uncertainty"],
-    ["fitting.planning"],
+    ["fitting.planning", "fitting.profiles"],
     ["fitting"],
     ["diffatmo"],  # the lazy public interface
     ["diffatmo.cli", "diffatmo.cli.cache", "diffatmo.cli.common", "diffatmo.cli.workers"],
