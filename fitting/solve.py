@@ -95,14 +95,14 @@ LARGEST_DEVIATION = 0.03
 LARGEST_MISFIT = 100.0
 """Reduced χ² up to which residuals are taken for noise that may hide an optimum; beyond it the model is wrong somewhere."""
 
-ASTRAY = 10.0
+ASTRAY = 2.0
 """Reduced χ² beyond which the search from the given start is not trusted to have found the best minimum."""
 
 PATIENCE = 40
 """Steps after which a search with such a χ² is given up for others."""
 
 OTHERS = 3
-"""Starts that are tried then, at most."""
+"""Starts that are tried then, at most: fewer if one leads to a better χ² than that, or to the same minimum again."""
 
 HOPELESS_MISFIT = 1e4
 """Reduced χ² of images that have nothing to do with the model: another unit, another exposure."""
@@ -399,16 +399,22 @@ def _elsewhere(
         start = evaluate(jnp.asarray(point, dtype), problem)
         y = jnp.asarray(np.append(point, _starting_exposures(np.asarray(start.radiance), problem.batch)), dtype)
         if np.isfinite(np.asarray(start.tangents)[np.asarray(problem.batch.used)]).all():
-            yield search(y, start, _rescaled(y, start, problem))
+            yield search(y, start, problem)
+
+
+def _apart(a: Point, b: Point, problem: Problem) -> float:
+    """Standard errors between two minima."""
+    misfit = min(a.chi2, b.chi2) / max(_count(problem.batch) - a.y.size, 1)
+    return separation(np.asarray(a.y), np.asarray(b.y), (a.triangle, b.triangle), misfit)
 
 
 def _distinct(points: Sequence[Point], problem: Problem) -> list[Point]:
     """The best of ``points``, then every other minimum that is a rival of it. An interrupted search interrupts the best."""
     best, *others = sorted(points, key=lambda point: point.chi2)
-    kept, misfit = [best], best.chi2 / max(_count(problem.batch) - best.y.size, 1)
+    kept = [best]
     for point in others:
-        apart = [separation(np.asarray(point.y), np.asarray(o.y), (point.triangle, o.triangle), misfit) for o in kept]
-        if point.converged and point.chi2 < RIVAL * best.chi2 and min(apart) > APART:
+        rival = point.converged and point.chi2 < RIVAL * best.chi2
+        if rival and min(_apart(point, other, problem) for other in kept) > APART:
             kept.append(point)
     if any(point.message == INTERRUPTED for point in points):
         kept[0] = best._replace(converged=False, message=INTERRUPTED)
@@ -633,16 +639,16 @@ def solve(
             )
             try:
                 for point in islice(more, wanted):
+                    again = _apart(point, min(points, key=lambda other: other.chi2), problem) < APART
                     points.append(point)
-                    # What was only sought because the first search had gone astray has been found.
-                    if point.message == INTERRUPTED or (starts is None and point.converged and point.chi2 < astray):
+                    enough = starts is None and point.converged and (again or point.chi2 < astray)
+                    if enough or point.message == INTERRUPTED:
                         break
             except KeyboardInterrupt:
                 points[0] = best._replace(converged=False, message=INTERRUPTED)
             tried = len(points) - 1
             best, *rivals = _distinct(points, problem)
             search, aside = (partial(each, max_steps=len(history) + max_steps) for each in (search, aside))
-        y, start = best.y, best.linearisation
         y, start = best.y, best.linearisation
         interrupted = best.message == INTERRUPTED
         if interrupted or problem.loss is None:

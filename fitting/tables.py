@@ -170,7 +170,8 @@ def profile_text(profile: Profile) -> str:
     if profile.standard_error is None:
         said += "; it has no standard error"
     elif profile.differs:
-        said += f"; not the {format_number(profile.value, profile.standard_error)} ± {profile.standard_error:.2g} of the covariance"
+        value = format_number(profile.value, profile.standard_error)
+        said += f"; not the {value} ± {profile.standard_error:.2g} of the covariance"
     if not profile.settled.all():
         said += f"; {int((~profile.settled).sum())} of {len(profile.points)} points did not converge"
     return said

@@ -221,7 +221,7 @@ def fit(
         refine: Whether the last steps explain the images by the model's ``finer`` self, if it has one, and the error bars
             take in what that may leave of the model's error. False fits images that ``model`` itself has made.
         starts: From how many starts to search: that of ``init``, and the best of a coarse grid about it
-            (:mod:`fitting.starts`). None is one, and up to three more if its search ends at a reduced χ² above 10 or is still
+            (:mod:`fitting.starts`). None is one, and up to three more if its search ends at a reduced χ² above 2 or is still
             there after 40 steps. Several distinct minima, if there are, are in ``minima``.
         checkpoint: A file that holds the best point after every step, and from which the same fit goes on if it exists. It
             is left for the caller to remove.
