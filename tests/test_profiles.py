@@ -58,7 +58,12 @@ def heights(noise, seed=3):
     truth = toy_sky.change(toy_sky.truth(), mie_scale_height=1.0)
     seen = observation(Pattern(), truth, noise=noise, seed=seed)
     return fit(
-        [seen], init=truth, free=["mie_scale_height", "ground_albedo"], tie={"ground_albedo": "grey"}, model=Pattern()
+        [seen],
+        init=truth,
+        free=["mie_scale_height", "ground_albedo"],
+        tie={"ground_albedo": "grey"},
+        model=Pattern(),
+        tolerance=0.01,
     )
 
 
@@ -97,14 +102,20 @@ def test_interval_ends_at_the_bound_of_the_range():
     assert high > found.value + found.standard_error
 
 
-def test_derived_numbers_and_spectral_fields():
+def test_a_spectral_field_stands_for_its_numbers():
+    result = profile(linear(), "ground_albedo", points=5)
+    assert [found.name for found in result.profiles] == [f"ground_albedo_{nm}" for nm in (680, 550, 440)]
+    # One factor moves all three.
+    np.testing.assert_allclose(result.profiles[0].delta_chi2, result.profiles[2].delta_chi2, atol=0.01)
+
+
+def test_derived_numbers():
+    """An optical depth is a product of two fitted numbers, either of which is known far less well."""
     result = fit(
         toy_sky.observations(), init=toy_sky.truth(), free=["mie_scattering", "mie_scale_height"], model=toy_sky.Toy()
     )
-    result = profile(result, "mie_optical_depth", points=5)
-    assert [found.name for found in result.profiles] == [f"mie_optical_depth_{nm}" for nm in (680, 550, 440)]
-    for found in result.profiles:
-        assert off_parabola(found) < 0.3
+    (found,) = profile(result, "mie_optical_depth_550", points=5).profiles
+    assert off_parabola(found) < 0.3
 
 
 def test_what_cannot_be_profiled_is_refused(tmp_path):

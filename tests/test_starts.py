@@ -84,7 +84,7 @@ def test_the_truth_is_the_best_of_the_grid(factor):
 def test_a_fit_that_goes_astray_begins_anew():
     said = {"free": FREE, "model": Toy()}
     images, start = toy_sky.observations(), wrong(0.2, 2, 0.5, -0.3)
-    lost = fit(images, init=start, starts=1, **said)
+    lost = fit(images, init=start, starts=1, max_steps=45, **said)
     assert not lost.converged
     assert lost.reduced_chi2 > 2
     found = fit(images, init=start, **said)

@@ -320,6 +320,8 @@ def run(job: Job, directory: Path, *, overwrite: bool, quiet: bool = False) -> b
         if job.profile and result.converged:
             console.print("Profiles:")
             result = fitting.profile(result, *job.profile, progress=show_point)
+        elif job.profile:
+            console.print("No profiles: they are about an optimum, and none was found.")
         report.write(result, directory, truth=job.truth, overwrite=overwrite)
     if result.message != INTERRUPTED:
         file.unlink(missing_ok=True)
