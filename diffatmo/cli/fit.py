@@ -203,6 +203,7 @@ def prepare(spec: FitSpec) -> Job:
     parameters = select(init, free, tie)
     known = [prior for table in spec.priors or () for prior in make_priors(table, parameters)]
     priors.collect(known, parameters)
+    profile = check_profile(spec.profile or (), parameters)
     seen = [observe(image, name, init) for image, name in zip(spec.images, image_names(spec.images), strict=True)]
     # Images of different atmospheres have no truth in common.
     truths = {dumps(truth): truth for truth in (image.truth for image in seen) if truth is not None}
@@ -220,7 +221,7 @@ def prepare(spec: FitSpec) -> Job:
         refine=any(image.model != model for image in seen),
         max_steps=spec.max_steps or MAX_STEPS,
         starts=spec.starts,
-        profile=check_profile(spec.profile or (), parameters),
+        profile=profile,
     )
 
 
