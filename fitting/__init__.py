@@ -11,11 +11,12 @@
 
 from fitting import planning, priors, report
 from fitting._errors import FitError
-from fitting.findings import Estimate
+from fitting.findings import Estimate, Minimum, Profile
 from fitting.observation import Observation, observe
 from fitting.parameters import FREE_FIELDS
 from fitting.prediction import Prediction
 from fitting.priors import Prior
+from fitting.profiles import profile
 from fitting.result import FitResult
 from fitting.solve import Step
 from fitting.uncertainty import fit
@@ -25,13 +26,16 @@ __all__ = [
     "Estimate",
     "FitError",
     "FitResult",
+    "Minimum",
     "Observation",
     "Prediction",
     "Prior",
+    "Profile",
     "Step",
     "fit",
     "observe",
     "planning",
     "priors",
+    "profile",
     "report",
 ]

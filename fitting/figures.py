@@ -3,6 +3,7 @@
 import io
 import math
 from collections.abc import Sequence
+from statistics import NormalDist
 
 import jax.numpy as jnp
 import matplotlib
@@ -15,7 +16,7 @@ from matplotlib.figure import Figure, FigureBase
 from matplotlib.ticker import MaxNLocator
 
 from diffatmo import color
-from fitting.findings import Findings
+from fitting.findings import NINETY_FIVE, ONE_SIGMA, Findings, Profile
 from fitting.observation import Observation
 
 Image = Float[np.ndarray, "height width w"]
@@ -143,6 +144,39 @@ def convergence_figure(result: Findings) -> Figure:
     axes.legend(fontsize=8, frameon=False)
     axes.grid(alpha=0.25)
     return figure
+
+
+def profile_figure(profiles: Sequence[Profile]) -> Figure:
+    """Δχ² against the value of each number, the parabola of its standard error, and the heights of 68 % and 95 %."""
+    columns = min(len(profiles), 3)
+    rows = math.ceil(len(profiles) / columns)
+    figure = Sheet(figsize=(4.2 * columns, 3.2 * rows), layout="constrained")
+    panels = figure.subplots(rows, columns, squeeze=False).ravel()
+    for axes, profile in zip(panels, profiles, strict=False):
+        _profile_panel(axes, profile)
+    for axes in panels[len(profiles) :]:
+        axes.set_axis_off()
+    return figure
+
+
+def _profile_panel(axes: Axes, profile: Profile) -> None:
+    axes.plot(profile.points, profile.delta_chi2, "o-", color="#1f5fa8", markersize=3.5, label="profile")
+    if profile.standard_error:
+        values = np.linspace(profile.points[0], profile.points[-1], 200)
+        parabola = ((values - profile.value) / profile.standard_error) ** 2
+        axes.plot(values, parabola, "--", color="#888", linewidth=1, label="covariance")
+    for level, colour in ((ONE_SIGMA, "#1b7f4b"), (NINETY_FIVE, "#c2571a")):
+        height = NormalDist().inv_cdf((1 + level) / 2) ** 2
+        axes.axhline(height, color=colour, linewidth=0.8)
+        for end in profile.interval(level):
+            if end is not None:
+                axes.plot([end, end], [0, height], color=colour, linewidth=0.8)
+        axes.annotate(f"{100 * level:.0f} %", (profile.points[0], height), fontsize=7, color=colour, va="bottom")
+    axes.set_ylim(0, 10)
+    axes.set_xlabel(profile.name + f", {profile.unit}" * bool(profile.unit), fontsize=9)
+    axes.set_ylabel("Δχ²")
+    axes.legend(fontsize=8, frameon=False)
+    axes.tick_params(labelsize=8)
 
 
 def correlation_figure(result: Findings) -> Figure:

@@ -4,11 +4,13 @@
 holds, is the same with those uses as its methods.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from statistics import NormalDist
 from typing import Self
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from diffatmo.atmosphere import Atmosphere
 from diffatmo.models import Model
@@ -18,6 +20,12 @@ from fitting.observation import Observation, sigma
 from fitting.priors import Prior
 from fitting.quantities import numbers
 from fitting.solve import Step
+
+ONE_SIGMA, NINETY_FIVE = 0.6827, 0.95
+"""Probabilities of intervals."""
+
+DIFFERENT = 0.1
+"""Part of its width by which an interval differs from another."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +59,75 @@ class Estimate:
 
 
 @dataclass(frozen=True)
+class Minimum:
+    """One of several minima: its numbers, and its χ²."""
+
+    values: dict[str, float]
+    chi2: float
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What was asked for, which it takes to fit again, and the coordinates that were found (:mod:`fitting.parameters`)."""
+
+    init: Atmosphere
+    free: list[str]
+    tie: dict[str, str]
+    loss: str | None
+    coordinates: Float[np.ndarray, " n"]
+
+
+@dataclass(frozen=True)
+class Profile:
+    """Δχ² of one number against its value, everything else fitted again; see :mod:`fitting.profiles`."""
+
+    name: str
+    unit: str
+    value: float
+    standard_error: float | None
+    points: Float[np.ndarray, " p"]
+    """Values of the number, in increasing order."""
+    delta_chi2: Float[np.ndarray, " p"]
+    """χ² there above the least, in the unit of the error bars."""
+    settled: Bool[np.ndarray, " p"]
+    """Whether the search of everything else converged."""
+    bounded: Sequence[bool]
+    """Whether the first and the last point are where the range of the number ends."""
+
+    def interval(self, level: float = ONE_SIGMA) -> tuple[float | None, float | None]:
+        """The ends of the interval that holds the number with the probability ``level``; None where it is open.
+
+        The root of Δχ², with the sign of the side, is taken to be linear between the points: exact for a parabola.
+        """
+        height = NormalDist().inv_cdf((1 + level) / 2)
+        least = int(np.argmin(self.delta_chi2))
+        root = np.sqrt(np.maximum(self.delta_chi2, 0))
+        ends: list[float | None] = []
+        for side, bounded in ((slice(least, None, -1), self.bounded[0]), (slice(least, None), self.bounded[1])):
+            points, heights = self.points[side], root[side]
+            beyond = np.flatnonzero(heights >= height)
+            if beyond.size:
+                last = int(beyond[0])
+                part = (height - heights[last - 1]) / (heights[last] - heights[last - 1])
+                ends.append(float(points[last - 1] + part * (points[last] - points[last - 1])))
+            else:
+                ends.append(float(points[-1]) if bounded else None)
+        return ends[0], ends[1]
+
+    @property
+    def differs(self) -> bool:
+        """Whether an end of either interval is off that of the covariance by more than a tenth of the standard error."""
+        if self.standard_error is None:
+            return True
+        for level in (ONE_SIGMA, NINETY_FIVE):
+            width = NormalDist().inv_cdf((1 + level) / 2) * self.standard_error
+            for end, sign in zip(self.interval(level), (-1, 1), strict=True):
+                if end is None or abs(end - self.value - sign * width) > DIFFERENT * width:
+                    return True
+        return False
+
+
+@dataclass(frozen=True)
 class Findings:
     """What a fit found. Arrays are NumPy's; ``covariance`` belongs to the numbers named in ``covariance_names``.
 
@@ -78,6 +155,11 @@ class Findings:
     priors: list[Prior] = field(default_factory=list)
     outliers: list[int] = field(default_factory=list)
     """Pixels of each image to which a robust loss gave less than half their weight."""
+    minima: list[Minimum] = field(default_factory=list)
+    """The distinct minima that were found, if there are several: the best first, all before any correction by a finer model."""
+    profiles: list[Profile] = field(default_factory=list)
+    """Of the numbers for which they were asked for (:func:`fitting.profile`)."""
+    setup: Setup | None = None
     model: Model | None = None
     refine: bool = True
 

@@ -6,6 +6,7 @@
 - ``atmosphere.toml``, the fitted atmosphere as every other command reads it,
 - ``fitted_<image>.exr`` and ``.png``, what the images should look like, and ``residual_<image>.exr`` and ``.png``,
   measured / fitted - 1,
+- ``profile_<name>.png`` of every profile likelihood,
 - ``report.html``, self-contained.
 
 ``fit.json`` holds finite numbers or null, under the keys
@@ -28,6 +29,11 @@
 ``priors``            ``name``, ``value``, ``error``, ``relative`` (of the logarithm), ``source`` of each
 ``undetermined``      names of the numbers that the images do not determine
 ``covariance``        ``names`` and ``matrix`` (of all numbers above), ``correlation`` likewise
+``profiles``          for each profile likelihood: ``name``, ``unit``, ``value``, ``standard_error``, ``points`` (values of
+                      the number), ``delta_chi2``, ``settled``, ``bounded`` (whether the first and the last point are where
+                      the range ends), ``interval_68`` and ``interval_95`` (null: open on that side), ``differs`` (from that
+                      of the standard error)
+``minima``            ``chi2`` and ``values`` of each, the best first, if the search found several
 ``images``            for each: place, sun as given, which nuisances are free, masked pixels by reason, pixels that a robust
                       loss takes for outliers, and ``residuals``: per wavelength the median and the root mean square of
                       measured / fitted - 1, and the root mean square in sigmas
@@ -63,20 +69,21 @@ from fitting.figures import (
     diverging,
     histogram_figure,
     image_figure,
+    profile_figure,
     residual_scale,
 )
-from fitting.findings import Estimate, Findings
+from fitting.findings import NINETY_FIVE, ONE_SIGMA, Estimate, Findings, Profile
 from fitting.nuisances import KINDS, group_of
 from fitting.observation import FIXED, PER_CHANNEL, Observation
 from fitting.storage import installed_version
-from fitting.tables import notes, page_table, table, verdict
+from fitting.tables import notes, page_table, profile_text, table, verdict
 
 __all__ = ["STYLE", "check_writable", "figure_tag", "file_names", "page", "record", "scene_of", "table", "write"]
 
 SCHEMA, SCHEMA_VERSION = "diffatmo-fit", 2
 
 FIXED_NAMES = ("fit.json", "atmosphere.toml", "report.html")
-IMAGE_PREFIXES = ("fitted_", "residual_")
+IMAGE_PREFIXES = ("fitted_", "residual_", "profile_")
 
 
 def check_writable(directory: str | Path, *, overwrite: bool = False) -> Path:
@@ -121,6 +128,13 @@ def write(
             return lambda file: scene.save(file, pixels, shot, overwrite=overwrite)
         return lambda file: imageio.write_exr(file, pixels, wavelengths=wavelengths, overwrite=overwrite)
 
+    def chart(profile: Profile) -> Callable[[Path], None]:
+        def task(file: Path) -> None:
+            with imageio.atomic_write(file, overwrite=overwrite) as temporary:
+                temporary.write_bytes(as_png(profile_figure([profile])))
+
+        return task
+
     tasks = {
         "fit.json": text(lambda: json.dumps(record(result), indent=1, allow_nan=False) + "\n"),
         "atmosphere.toml": text(lambda: atmosphere.dumps(result.atmosphere)),
@@ -132,6 +146,8 @@ def write(
         tasks[f"fitted_{name}.png"] = png(developed(observation, fitted, wavelengths)[1])
         tasks[f"residual_{name}.exr"] = exr(residual, None)
         tasks[f"residual_{name}.png"] = png(diverging(np.mean(residual, axis=-1), scale))
+    for profile in result.profiles:
+        tasks[f"profile_{profile.name}.png"] = chart(profile)
     tasks["report.html"] = text(lambda: page(result))
     failures = []
     for file, task in tasks.items():
@@ -224,6 +240,16 @@ def record(result: Findings) -> dict[str, Any]:
             "priors": [asdict(prior) for prior in result.priors],
             "covariance": {"names": result.covariance_names, "matrix": result.covariance},
             "correlation": {"names": result.covariance_names, "matrix": result.correlation},
+            "profiles": [
+                asdict(profile)
+                | {
+                    "interval_68": profile.interval(ONE_SIGMA),
+                    "interval_95": profile.interval(NINETY_FIVE),
+                    "differs": profile.differs,
+                }
+                for profile in result.profiles
+            ],
+            "minima": [asdict(minimum) for minimum in result.minima],
             "images": [_image_record(result, number) for number in range(len(result.observations))],
             "history": [step._asdict() for step in result.history],
             "timings": result.timings,
@@ -297,6 +323,7 @@ def page(result: Findings) -> str:
         "".join(f"<p>{html.escape(note)}</p>" for note in notes(result)),
         "<h2>Parameters</h2>",
         page_table(result),
+        *_profile_section(result),
         "<h2>Images</h2>",
         *images,
         "<h2>Fit</h2><div class=pair>",
@@ -311,6 +338,17 @@ def page(result: Findings) -> str:
         "</html>",
     ]
     return "\n".join(parts)
+
+
+def _profile_section(result: Findings) -> list[str]:
+    if not result.profiles:
+        return []
+    words = "".join(f"<li>{html.escape(profile_text(profile))}.</li>" for profile in result.profiles)
+    caption = (
+        "Δχ² where one number is held and all others are fitted again, against the parabola of its standard error. Where it is "
+        "below a line, the number is inside that interval."
+    )
+    return ["<h2>Profile likelihood</h2>", f"<ul>{words}</ul>", figure_tag(profile_figure(result.profiles), caption)]
 
 
 def figure_tag(figure: Figure, caption: str) -> str:

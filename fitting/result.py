@@ -19,6 +19,7 @@ _FIGURES: dict[str, Callable[[Findings], Figure]] = {
     "residuals": figures.histogram_figure,
     "correlation": figures.correlation_figure,
     "convergence": figures.convergence_figure,
+    "profiles": lambda result: figures.profile_figure(result.profiles),
 }
 """What can be plotted."""
 
@@ -41,10 +42,13 @@ class FitResult(Findings):
         """A figure, drawn without pyplot: ``figure.savefig("fit.pdf")``; a notebook shows it as it is.
 
         ``what`` is ``"images"`` (every image measured, fitted, and the residual), ``"residuals"`` (their distribution, in
-        sigmas), ``"correlation"`` (of the fitted numbers) or ``"convergence"``. Raises :class:`FitError` for anything else.
+        sigmas), ``"correlation"`` (of the fitted numbers), ``"convergence"``, or ``"profiles"`` (those that
+        :func:`fitting.profile` has put into the result). Raises :class:`FitError` for anything else.
         """
         if what not in _FIGURES:
             raise FitError(f"plot: got {what!r}, expected one of {', '.join(_FIGURES)}")
+        if what == "profiles" and not self.profiles:
+            raise FitError("plot: the result has no profiles; fitting.profile(result, name) puts them in")
         return _FIGURES[what](self)
 
     def to_rows(self) -> list[dict[str, Any]]:

@@ -16,6 +16,9 @@ with it at the optimum, and the last pass explains the images by the finer model
 *Linear nuisances*, exposures and pedestals, are at their optimum wherever χ² is evaluated, and the search is in the other
 coordinates alone (:mod:`fitting.elimination`).
 
+*Starts.* A search that has gone astray, which its χ² shows, is begun anew from the best atmospheres of a coarse grid
+(:mod:`fitting.starts`).
+
 *Noise.* sigma depends on the expected signal, which is known only after the fit. Taken from the noisy pixels it
 favours those that came out dark, and biases the radiance by about -2 (relative noise)²: 2e-4 for 1 % noise, ten
 standard errors of a well-determined parameter. So the fit starts with sigma from the measured signal, and goes on with that
@@ -25,9 +28,10 @@ from the fitted one.
 import math
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -67,6 +71,7 @@ from fitting.residuals import (
     whitened,
 )
 from fitting.robust import Loss, scale
+from fitting.starts import APART, RIVAL, ranked, separation
 
 TOLERANCE = 0.1
 """Distance to the optimum, in standard errors, at which the fit has converged."""
@@ -99,6 +104,15 @@ LARGEST_DEVIATION = 0.03
 LARGEST_MISFIT = 100.0
 """Reduced χ² up to which residuals are taken for noise that may hide an optimum; beyond it the model is wrong somewhere."""
 
+ASTRAY = 2.0
+"""Reduced χ² beyond which the search from the given start is not trusted to have found the best minimum."""
+
+PATIENCE = 40
+"""Steps after which a search with such a χ² is given up for others."""
+
+OTHERS = 3
+"""Starts that are tried then, at most: fewer if one leads to a better χ² than that, or to the same minimum again."""
+
 HOPELESS_MISFIT = 1e4
 """Reduced χ² of images that have nothing to do with the model: another unit, another exposure."""
 
@@ -119,6 +133,7 @@ OUT_OF_STEPS = "stopped: not converged in the steps allowed"
 UNLIKE = (
     "the images are not of such a sky: residuals are {:.0f} times the noise; are exposure, units, camera and sun right?"
 )
+ELSEWHERE = "{}; from one of {} other starts, as the one given leads to a χ² {:.2g} times as large"
 TOO_COARSE = "converged, but the model's finer self differs from it by {:.0%}: the error bars do not hold"
 
 # The test for convergence is made here, so optimistix's own is set out of reach. Its trust region trusts a step only if
@@ -178,6 +193,8 @@ class Solution(NamedTuple):
     """What a robust loss makes of the covariance (:meth:`fitting.robust.Loss.inflation`)."""
     outliers: list[int]
     """Pixels of each image to which a robust loss gives less than half their weight."""
+    minima: list[tuple[Coordinates, float]]
+    """Coordinates and χ² of the minima, the best first, if there are several; before any correction by a finer model."""
 
     @property
     def chi2(self) -> float:
@@ -213,7 +230,7 @@ def _deviation(problem: Problem) -> Float[np.ndarray, "image w"]:
     return np.sqrt((deviation**2).sum(axis=1) / np.maximum(used.sum(axis=1), 1)[:, None])
 
 
-def _model_error(best: "_Point", problem: Problem) -> Float[np.ndarray, "n n"]:
+def _model_error(best: "Point", problem: Problem) -> Float[np.ndarray, "n n"]:
     """Covariance of the coordinates from what the correction leaves of the model's error.
 
     The finer model is taken to be off by :data:`REMAINING` of what the coarser one was off: in every image by a smooth random
@@ -280,7 +297,7 @@ def _shorten(y: Coordinates, trial: Coordinates, limits: tuple[np.ndarray, np.nd
     return jnp.clip(y + (trial - y) * jnp.minimum(1, LONGEST_STEP / jnp.where(largest > 0, largest, 1)), *limits)
 
 
-class _Point(NamedTuple):
+class Point(NamedTuple):
     """A point of the search, and why the search ended if it ended there."""
 
     y: Coordinates
@@ -292,7 +309,7 @@ class _Point(NamedTuple):
     message: str = OUT_OF_STEPS
 
 
-def _minimise(
+def minimise(
     y: Coordinates,
     start: Linearisation,
     problem: Problem,
@@ -304,17 +321,20 @@ def _minimise(
     progress: Progress | None,
     keep: Callable[[Coordinates, float], None],
     step_size: float | None = None,
-) -> _Point:
+    patience: int | None = None,
+) -> Point:
     """Levenberg-Marquardt from ``y``, where the model is linearised already, until ``history`` holds ``max_steps``.
 
     ``keep`` is given the best point and the step size after every step; ``step_size`` is that of the first one.
+    After ``patience`` steps a search that has still gone astray ends.
     """
+    begun = len(history)
     x, linear = problem.split(y)
     state = outermost(_start)(x)
     limits = jax.tree.map(np.asarray, problem.limits)
     freedom = max(_count(problem.batch) - y.size, 1)
     stage = history[-1].stage + 1 if history else 1
-    best: _Point | None = None
+    best: Point | None = None
     misfit, scale, rejections = 1.0, 1.0, 0
     try:
         while best is None or len(history) < max_steps:
@@ -347,7 +367,7 @@ def _minimise(
             x, state = outermost(_step)(x, state, (plane[:, -1], plane[:, :-1], trial))
             accepted = best is None or (finite and np.array_equal(x, trial))
             if best is None or accepted:
-                best, linear = _Point(whole, linearisation, factor, chi2, distance(held, misfit)), whole[x.size :]
+                best, linear = Point(whole, linearisation, factor, chi2, distance(held, misfit)), whole[x.size :]
             rejections = 0 if accepted else rejections + 1
             history.append(
                 Step(
@@ -370,6 +390,8 @@ def _minimise(
             end = _end(best.distance, rejections, tolerance)
             if end is not None:
                 return best._replace(converged=end[0], message=end[1])
+            if patience is not None and len(history) - begun >= patience and best.chi2 > ASTRAY * freedom:
+                break
     except KeyboardInterrupt:
         if best is None:
             raise
@@ -377,7 +399,41 @@ def _minimise(
     return best
 
 
-def _shares(best: _Point, problem: Problem) -> dict[str, Any]:
+def _elsewhere(
+    problem: Problem,
+    search: Callable[[Coordinates, Linearisation, Problem], Point],
+    evaluate: Callable[[Coordinates, Problem], Linearisation],
+) -> Iterator[Point]:
+    """Where searches from other starts end, the most promising first."""
+    dtype = problem.start.dtype
+    for point in ranked(problem):
+        x = jnp.asarray(np.append(point, np.zeros(problem.batch.nuisances.offsets)), dtype)
+        start = evaluate(x, problem)
+        y = jnp.append(x, jnp.asarray(starting(np.asarray(start.radiance), problem.batch), dtype))
+        if np.isfinite(np.asarray(start.tangents)[np.asarray(problem.batch.used)]).all():
+            yield search(y, start, problem)
+
+
+def _apart(a: Point, b: Point, problem: Problem) -> float:
+    """Standard errors between two minima."""
+    misfit = min(a.chi2, b.chi2) / max(_count(problem.batch) - a.y.size, 1)
+    return separation(np.asarray(a.y), np.asarray(b.y), (a.triangle, b.triangle), misfit)
+
+
+def _distinct(points: Sequence[Point], problem: Problem) -> list[Point]:
+    """The best of ``points``, then every other minimum that is a rival of it. An interrupted search interrupts the best."""
+    best, *others = sorted(points, key=lambda point: point.chi2)
+    kept = [best]
+    for point in others:
+        rival = point.converged and point.chi2 < RIVAL * best.chi2
+        if rival and min(_apart(point, other, problem) for other in kept) > APART:
+            kept.append(point)
+    if any(point.message == INTERRUPTED for point in points):
+        kept[0] = best._replace(converged=False, message=INTERRUPTED)
+    return kept
+
+
+def _shares(best: Point, problem: Problem) -> dict[str, Any]:
     """What the images contribute and what is known besides, and what a robust loss does."""
     shares: dict[str, Any] = {
         "of_images": best.triangle,
@@ -451,6 +507,31 @@ def _rescaled(y: Coordinates, linearisation: Linearisation, problem: Problem) ->
     return replace(problem, loss=Loss(problem.loss.name, jnp.asarray(found, y.dtype)))
 
 
+def restored(
+    observations: Sequence[Observation],
+    parameters: Parameters,
+    y: Coordinates,
+    *,
+    priors: Sequence[Prior],
+    loss: str | None,
+    model: Model,
+    refine: bool,
+) -> tuple[Problem, Linearisation]:
+    """The problem of which ``y`` is the solution, with noise, correction and scale of the loss as they are there."""
+    batch = stack(observations, [float(nm) for nm in parameters.init.wavelengths])
+    signal, shell = batch.measured, outermost(planet_shell)(model, parameters)
+    problem = Problem(model, parameters, batch, signal, shell, jnp.ones_like(signal), collect(priors, parameters))
+    if loss is not None:
+        problem = replace(problem, loss=Loss(loss, jnp.ones((), signal.dtype)))
+    start = outermost(linearise)(problem.split(y)[0], problem)
+    if refine and (finer := model.finer()) is not None:
+        correction = outermost(_correction)(problem.split(y)[0], problem, start.radiance, finer)
+        problem = replace(problem, correction=correction)
+        start = Linearisation(start.radiance * correction, start.tangents * correction[..., None])
+    problem = outermost(_weigh)(problem, outermost(light)(y, start, problem))
+    return _rescaled(y, start, problem), start
+
+
 def solve(
     observations: Sequence[Observation],
     *,
@@ -464,6 +545,7 @@ def solve(
     max_steps: int = MAX_STEPS,
     tolerance: float = TOLERANCE,
     refine: bool = True,
+    starts: int | None = None,
     checkpoint: Path | None = None,
 ) -> Solution:
     """Find the atmosphere that explains ``observations``; see :func:`fitting.fit`, which adds the error bars.
@@ -473,6 +555,8 @@ def solve(
     """
     if max_steps < 1:
         raise FitError(f"max_steps: got {max_steps}, expected at least 1")
+    if starts is not None and starts < 1:
+        raise FitError(f"starts: got {starts}, expected at least 1")
     if not tolerance > 0:
         raise FitError(f"tolerance: got {tolerance}, expected a number > 0")
     started = time.perf_counter()
@@ -528,16 +612,38 @@ def solve(
                 warnings.warn(f"{error}; the fit goes on without a checkpoint", stacklevel=2)
                 checkpoint = None
 
-    search = partial(_minimise, evaluate=evaluate, max_steps=max_steps, history=history, progress=progress, keep=keep)
+    search = partial(minimise, evaluate=evaluate, max_steps=max_steps, history=history, progress=progress, keep=keep)
+    # A broken-off fit goes on from the best point, not from one that was only tried.
+    aside = partial(search, keep=lambda *_: None)
     rough = max(tolerance, FIRST_PASS_TOLERANCE)
     # A search that goes on has the step size that it had, any other begins with its own.
     step_size = None if saved is None else saved.step_size
     y, scales = jnp.concatenate([x, jnp.asarray(linear, x.dtype)]), [math.inf]
-    interrupted = False
+    interrupted, tried, first, rivals = False, 0, math.nan, list[Point]()
+    astray = ASTRAY * max(_count(batch) - size, 1)
     while not final:
         problem = _rescaled(y, start, problem)
-        best = search(y, start, problem, tolerance=rough, step_size=step_size)
+        patience = PATIENCE if starts is None and not tried else None
+        best = search(y, start, problem, tolerance=rough, step_size=step_size, patience=patience)
         step_size = None
+        wanted = 0 if tried else starts - 1 if starts is not None else OTHERS * (best.chi2 > astray)
+        if wanted and best.message != INTERRUPTED and len(history) < max_steps:
+            points, first = [best], best.chi2
+            more = _elsewhere(
+                problem, partial(aside, tolerance=rough, max_steps=len(history) + wanted * max_steps), evaluate
+            )
+            try:
+                for point in islice(more, wanted):
+                    again = _apart(point, min(points, key=lambda other: other.chi2), problem) < APART
+                    points.append(point)
+                    enough = starts is None and point.converged and (again or point.chi2 < astray)
+                    if enough or point.message == INTERRUPTED:
+                        break
+            except KeyboardInterrupt:
+                points[0] = best._replace(converged=False, message=INTERRUPTED)
+            tried = len(points) - 1
+            best, *rivals = _distinct(points, problem)
+            search, aside = (partial(each, max_steps=len(history) + max_steps) for each in (search, aside))
         y, start = best.y, best.linearisation
         interrupted = best.message == INTERRUPTED
         if interrupted or problem.loss is None:
@@ -551,6 +657,10 @@ def solve(
         problem = outermost(_weigh)(problem, outermost(light)(y, start, problem))
         problem = _rescaled(y, start, problem)
         best = search(y, start, problem, tolerance=tolerance, step_size=step_size)
+        if best.message != INTERRUPTED:
+            others = [aside(other.y, other.linearisation, problem, tolerance=tolerance) for other in rivals]
+            best, *rivals = _distinct([best, *others], problem)
+    minima = [(point.y, point.chi2) for point in (best, *rivals)] if rivals else []
     model_error = np.zeros((size, size))
     if finer is not None and best.converged:
         x, radiance = best.y[: problem.size], best.linearisation.radiance
@@ -569,6 +679,8 @@ def solve(
     misfit = float(np.sum(best.triangle[:, -1] ** 2)) / max(_count(batch) - size, 1)
     if best.converged and misfit > HOPELESS_MISFIT:
         best = best._replace(converged=False, message=UNLIKE.format(math.sqrt(misfit)))
+    if best.converged and first > RIVAL * best.chi2:
+        best = best._replace(message=ELSEWHERE.format(best.message, tried, first / best.chi2))
     total = time.perf_counter() - started
     # What a typical evaluation does not explain is compilation and preparation, which happen once.
     evaluations = min(total, len(seconds) * float(np.median(seconds)))
@@ -584,6 +696,7 @@ def solve(
         residual_count=_count(batch),
         converged=best.converged,
         message=best.message,
+        minima=minima,
         timings={"compile_s": total - evaluations, "solve_s": evaluations, "total_s": total},
         **_shares(best, problem),
     )

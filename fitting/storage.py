@@ -27,7 +27,7 @@ from diffatmo.camera import PROJECTIONS
 from diffatmo.models import MODELS, Model
 from diffatmo.phase import PhaseTable
 from fitting._errors import FitError
-from fitting.findings import Estimate, Findings
+from fitting.findings import Estimate, Findings, Minimum, Profile, Setup
 from fitting.observation import Observation
 from fitting.priors import Prior
 from fitting.solve import Step
@@ -39,7 +39,19 @@ RECORD = "record"
 F = TypeVar("F", bound=Findings)
 
 _CLASSES: dict[str, Callable[..., Any]] = {
-    kind.__name__: kind for kind in (Atmosphere, Estimate, Observation, PhaseTable, Prior, Step, *PROJECTIONS.values())
+    kind.__name__: kind
+    for kind in (
+        Atmosphere,
+        Estimate,
+        Minimum,
+        Observation,
+        PhaseTable,
+        Prior,
+        Profile,
+        Setup,
+        Step,
+        *PROJECTIONS.values(),
+    )
 }
 """What a result is made of, by the name that stands in the file."""
 

@@ -18,7 +18,7 @@ from diffatmo import imageio
 from diffatmo.atmosphere import Atmosphere
 from fitting._errors import FitError
 from fitting.combinations import combinations
-from fitting.findings import Estimate, Findings
+from fitting.findings import NINETY_FIVE, ONE_SIGMA, Estimate, Findings, Minimum, Profile
 
 FAR = 3.0
 """Standard errors from the truth beyond which an estimate is marked."""
@@ -129,6 +129,11 @@ def notes(result: Findings) -> list[str]:
         found.append(f"The images do not determine {', '.join(result.undetermined)}.")
     if held := [e.name for e in result.parameters if e.at_bound]:
         found.append(f"At the bound of the range: {', '.join(held)}.")
+    if len(result.minima) > 1:
+        others = "; ".join(minimum_text(result, minimum) for minimum in result.minima[1:])
+        found.append(f"There are {len(result.minima)} minima, of which this is the best. Elsewhere: {others}.")
+    if result.profiles:
+        found.append(f"By profile likelihood: {'; '.join(profile_text(profile) for profile in result.profiles)}.")
     if result.error_scale > 1.05:
         found.append(
             f"The residuals are {result.error_scale:.1f} times as large as the stated noise, and so are the standard "
@@ -150,6 +155,44 @@ def notes(result: Findings) -> list[str]:
     ]:
         found.append(f"Better known together than alone: {'; '.join(said[:6])}.")
     return found
+
+
+def profile_text(profile: Profile) -> str:
+    """A profile in words: its intervals, where they are open, and where they are not those of the covariance."""
+
+    def between(level: float) -> str:
+        low, high = profile.interval(level)
+        width = (high if high is not None else profile.points[-1]) - (low if low is not None else profile.points[0])
+        shown = ["?" if end is None else format_number(end, width / 2) for end in (low, high)]
+        if low is None and high is None:
+            return "open on both sides"
+        if low is None or high is None:
+            return f"below {shown[1]}" if low is None else f"above {shown[0]}"
+        return f"{shown[0]} to {shown[1]}"
+
+    said = f"{profile.name}: {between(ONE_SIGMA)} (68 %), {between(NINETY_FIVE)} (95 %)"
+    if None in profile.interval(NINETY_FIVE):
+        said += f", open where χ² does not rise enough between {profile.points[0]:.4g} and {profile.points[-1]:.4g}"
+    if profile.standard_error is None:
+        said += "; it has no standard error"
+    elif profile.differs:
+        value = format_number(profile.value, profile.standard_error)
+        said += f"; not the {value} ± {profile.standard_error:.2g} of the covariance"
+    if not profile.settled.all():
+        said += f"; {int((~profile.settled).sum())} of {len(profile.points)} points did not converge"
+    return said
+
+
+def minimum_text(result: Findings, minimum: Minimum) -> str:
+    """A minimum in words: its χ², and what is different there by more than :data:`FAR` standard errors."""
+    errors = {e.name: e.standard_error for e in result.parameters}
+    best = result.minima[0]
+    moved = [
+        f"{name} = {value:.4g}"
+        for name, value in minimum.values.items()
+        if (error := errors.get(name)) is not None and abs(value - best.values[name]) > FAR * error
+    ]
+    return f"χ² {minimum.chi2 / best.chi2:.3g} times as large at {', '.join(moved) or 'slightly other values'}"
 
 
 def page_table(result: Findings) -> str:

@@ -30,7 +30,7 @@ from diffatmo.atmosphere import Atmosphere
 from diffatmo.compiling import outermost
 from diffatmo.models import Model, Moments
 from fitting.elimination import RANK_TOLERANCE
-from fitting.findings import Estimate
+from fitting.findings import Estimate, Minimum, Setup
 from fitting.nuisances import Nuisances, assumed
 from fitting.observation import Observation, unstack
 from fitting.parameters import Coordinates, Parameters
@@ -101,13 +101,16 @@ def summarise(
     *,
     priors: Sequence[Prior] = (),
     refine: bool,
+    free: Sequence[str] = (),
+    tie: Mapping[str, str] | None = None,
+    loss: str | None = None,
 ) -> FitResult:
     """Attach error bars to ``solution``, which was found with ``model``, and its finer self if ``refine``."""
     parameters = solution.parameters
     count = parameters.size
     wavelengths = [float(nm) for nm in parameters.init.wavelengths]
-    free, derived = parameters.fields, parameters.derived
-    fitted_quantities = quantities(free, wavelengths)
+    fields, derived = parameters.fields, parameters.derived
+    fitted_quantities = quantities(fields, wavelengths)
     all_quantities = fitted_quantities + quantities(derived, wavelengths)
 
     slopes, (numbers_found, atmosphere) = outermost(_slopes)(solution.y, parameters, solution.batch.nuisances)
@@ -121,7 +124,7 @@ def summarise(
     shares = data_shares(of_images, factor, gradient)
     covariance = covariance + gradient @ solution.model_error @ gradient.T
     errors = [math.sqrt(v) if ok else None for v, ok in zip(np.diag(covariance), determined, strict=True)]
-    initial = np.asarray(numbers(parameters.atmosphere(parameters.start), free + derived), dtype=float)
+    initial = np.asarray(numbers(parameters.atmosphere(parameters.start), fields + derived), dtype=float)
     at_bound = parameters.at_bound(np.asarray(solution.y)[:count])
 
     estimates = [
@@ -170,10 +173,26 @@ def summarise(
         fitted=[unstack(o, image) for o, image in zip(observations, solution.predicted, strict=True)],
         priors=[*priors, *(Prior(*known) for known in assumed(observations))],
         outliers=solution.outliers,
+        minima=_minima(solution),
+        setup=Setup(parameters.init, list(free), dict(tie or {}), loss, np.asarray(solution.y)),
         undetermined=[e.name for e in [*estimates, *nuisances] if e.standard_error is None],
         model=model,
         refine=refine,
     )
+
+
+def _minima(solution: Solution) -> list[Minimum]:
+    """The minima of the solution in the numbers that are reported."""
+    parameters = solution.parameters
+    names = [
+        q.name
+        for q in quantities([*parameters.fields, *parameters.derived], np.asarray(parameters.init.wavelengths).tolist())
+    ]
+    found = [outermost(_physical)(y, parameters, solution.batch.nuisances)[0] for y, _ in solution.minima]
+    return [
+        Minimum(dict(zip(names, np.asarray(values, float).tolist(), strict=False)), chi2)
+        for values, (_, chi2) in zip(found, solution.minima, strict=True)
+    ]
 
 
 def fit(
@@ -189,6 +208,7 @@ def fit(
     max_steps: int = MAX_STEPS,
     tolerance: float = TOLERANCE,
     refine: bool = True,
+    starts: int | None = None,
     checkpoint: Path | None = None,
 ) -> FitResult:
     """Recover an atmosphere's parameters from images of its sky, with error bars.
@@ -206,10 +226,13 @@ def fit(
             (:mod:`fitting.robust`).
         model: How the sky is computed, :class:`~diffatmo.models.moments.Moments` by default.
         progress: Called after each step.
-        max_steps: Evaluations of the model with its derivatives before the fit gives up.
+        max_steps: Evaluations of the model with its derivatives before the fit gives up; each further start has as many.
         tolerance: Distance to the optimum, in standard errors, at which it is found.
         refine: Whether the last steps explain the images by the model's ``finer`` self, if it has one, and the error bars
             take in what that may leave of the model's error. False fits images that ``model`` itself has made.
+        starts: From how many starts to search: that of ``init``, and the best of a coarse grid about it
+            (:mod:`fitting.starts`). None is one, and up to three more if its search ends at a reduced χ² above 2 or is still
+            there after 40 steps. Several distinct minima, if there are, are in ``minima``.
         checkpoint: A file that holds the best point after every step, and from which the same fit goes on if it exists. It
             is left for the caller to remove.
 
@@ -233,6 +256,7 @@ def fit(
         max_steps=max_steps,
         tolerance=tolerance,
         refine=refine,
+        starts=starts,
         checkpoint=checkpoint,
     )
-    return summarise(solution, observations, model, priors=priors, refine=refine)
+    return summarise(solution, observations, model, priors=priors, refine=refine, free=free, tie=tie, loss=loss)

@@ -287,6 +287,7 @@ def test_fit_of_a_scene_file(tmp_path, s1, start, toy):
         imageio.write_exr(folder / f"bare_{z}.exr", 2 * pixels)
     (folder / "scene.toml").write_text(
         'init = "start.toml"\nfree = ["rayleigh_scattering", "mie_g"]\ntie = { rayleigh_scattering = "start" }\n'
+        'starts = 2\nprofile = ["mie_g"]\n'
         + "".join(
             f'[[image]]\nfile = "bare_{z}.exr"\nprojection = "equirectangular"\naltitude_km = 0.1\n'
             f"sun_zenith_deg = {z}.0\nsun_azimuth_deg = {math.degrees(0.3)}\n"
@@ -301,6 +302,8 @@ def test_fit_of_a_scene_file(tmp_path, s1, start, toy):
     assert np.allclose(ratio, ratio[0], rtol=1e-5)
     assert record["nuisances"]["exposure_camera"]["value"] * ratio[0] == pytest.approx(2, rel=0.05)
     assert record["parameters"]["mie_g"]["truth"] is None
+    assert record["profiles"][0]["interval_68"][0] < record["parameters"]["mie_g"]["value"]
+    assert (tmp_path / "out" / "profile_mie_g.png").exists()
 
 
 def test_options_come_before_the_header(tmp_path, s1, start, toy):

@@ -110,18 +110,14 @@ def test_offsets_and_pedestals_are_recovered_and_do_not_bias_the_air():
         }
     truth |= {"focal_lens": 1.02, "focal_c": 0.98}
     for image in images:
-        clean = np.median(image.image[image.used]) / 1.01
-        truth[f"pedestal_{image.name}"] = pytest.approx(0.01 * clean, rel=0.5)
+        truth[f"pedestal_{image.name}"] = 0.01 * np.median(image.image) / 1.01
     assert {e.name for e in found.nuisances} == set(truth)
     for estimate in found.nuisances:
-        if estimate.name.startswith("pedestal"):
-            assert estimate.value == truth[estimate.name]
-            assert estimate.standard_error < 0.3 * estimate.value
-        else:
-            assert abs(estimate.value - truth[estimate.name]) < 4 * estimate.standard_error, estimate
-            assert estimate.unit == ("" if estimate.name.startswith("focal") else "deg")
-            # What is known beforehand is 0.5°, 2° and 5 %.
-            assert estimate.standard_error < (0.005 if estimate.name.startswith("focal") else 0.6)
+        kind = estimate.name.split("_")[0]
+        assert abs(estimate.value - truth[estimate.name]) < 4 * estimate.standard_error, estimate
+        assert estimate.unit == ("deg" if kind in ("sun", "pose") else "")
+        # What is known beforehand is 0.5°, 2° and 5 %; a pedestal is 2e-4.
+        assert estimate.standard_error < {"sun": 0.5, "pose": 0.6, "focal": 0.002, "pedestal": 1e-5}[kind]
     for estimate in found.with_truth(toy_sky.truth()).parameters:
         assert abs(estimate.pull) < 4, estimate
 
@@ -149,7 +145,11 @@ LENSES = (Fisheye(8, 8), Pinhole(6, 8, fov_y=1.0, pitch=0.9), Equirectangular(6,
 
 @pytest.mark.parametrize(
     ("model", "zenith", "parts", "lenses"),
-    [(Toy(), 0.0, 1, LENSES), (Toy(), 40.0, 4, LENSES), (RayMarch(steps=3), 0.0, 1, LENSES[:1])],
+    [
+        (Toy(), 0.0, 1, LENSES),
+        (Toy(), 40.0, 4, LENSES),
+        (RayMarch(steps=3), 0.0, 1, LENSES[:1]),
+    ],
 )
 def test_jacobian_against_differences(x64, model, zenith, parts, lenses):
     """Also with the sun at the zenith, and at no rotation, where angles have no derivative; and of averaged pixels."""
@@ -172,7 +172,9 @@ def test_jacobian_against_differences(x64, model, zenith, parts, lenses):
         steps = 1e-6 * jnp.eye(y.size)
         numeric = np.stack([plain(y + step, ours) - plain(y - step, ours) for step in steps], axis=-1) / 2e-6
         scale = np.abs(numeric).max(0)
-        assert np.all(scale > 0)
+        # Unmoved, a turn about the zenith changes nothing if the sun is there.
+        assert np.all(scale > 0) or (zenith == 0 and not y[1:].any())
+        scale = np.where(scale > 0, scale, 1)
         np.testing.assert_allclose(slope / scale, numeric / scale, atol=1e-5)
 
 

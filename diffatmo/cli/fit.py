@@ -11,7 +11,17 @@ import click
 from diffatmo.cli import keys, many, shipped
 from diffatmo.cli.common import InputError, make_console, make_model, overwrite_option, printable, read_atmosphere
 from diffatmo.cli.images import observe
-from diffatmo.cli.scenefile import FREE, IMAGE_KEYS, LOSSES, MODELS, FitSpec, ImageSpec, check_image_options, read_scene
+from diffatmo.cli.scenefile import (
+    FREE,
+    IMAGE_KEYS,
+    LOSSES,
+    MODELS,
+    FitSpec,
+    ImageSpec,
+    check_image_options,
+    did_you_mean,
+    read_scene,
+)
 
 if TYPE_CHECKING:
     from diffatmo.atmosphere import Atmosphere
@@ -40,6 +50,15 @@ MAX_STEPS = 100
 )
 @click.option("--model", type=click.Choice(MODELS), help="How the sky is computed.  [default: moments]")
 @click.option("--max-steps", type=click.IntRange(min=1), help="Steps before the fit gives up.  [default: 100]")
+@click.option(
+    "--starts",
+    type=click.IntRange(min=1),
+    help="From how many starts to search: the given one and the best of a grid about it.  [default: 1, and 3 more if that goes "
+    "astray]",
+)
+@click.option(
+    "--profile", metavar="NAME,...", help="Numbers whose profile likelihood is wanted: mie_g, mie_optical_depth_550, …"
+)
 @keys.options(IMAGE_KEYS)
 @click.option("--each", is_flag=True, help="Fit each image on its own, as those of a FOLDER are.")
 @click.option(
@@ -72,6 +91,8 @@ def fit(
     loss: str | None,
     model: str | None,
     max_steps: int | None,
+    starts: int | None,
+    profile: str | None,
     each: bool,
     processes: int | None,
     resume: bool,
@@ -96,6 +117,8 @@ def fit(
         "loss": loss,
         "model": model,
         "max_steps": max_steps,
+        "starts": starts,
+        "profile": _names(profile),
     }
     if resume and overwrite:
         raise InputError("--resume and --overwrite contradict each other: one keeps what is there, one replaces it")
@@ -165,6 +188,8 @@ class Job:
     model: str
     refine: bool
     max_steps: int
+    starts: int | None
+    profile: tuple[str, ...]
 
 
 def prepare(spec: FitSpec) -> Job:
@@ -178,6 +203,7 @@ def prepare(spec: FitSpec) -> Job:
     parameters = select(init, free, tie)
     known = [prior for table in spec.priors or () for prior in make_priors(table, parameters)]
     priors.collect(known, parameters)
+    profile = check_profile(spec.profile or (), parameters)
     seen = [observe(image, name, init) for image, name in zip(spec.images, image_names(spec.images), strict=True)]
     # Images of different atmospheres have no truth in common.
     truths = {dumps(truth): truth for truth in (image.truth for image in seen) if truth is not None}
@@ -194,7 +220,25 @@ def prepare(spec: FitSpec) -> Job:
         # A finer model would correct what is not wrong in images that the model itself has made.
         refine=any(image.model != model for image in seen),
         max_steps=spec.max_steps or MAX_STEPS,
+        starts=spec.starts,
+        profile=profile,
     )
+
+
+def check_profile(names: Sequence[str], parameters: "Parameters") -> tuple[str, ...]:
+    """``names``, each of a number of the fit, before it begins."""
+    from fitting.quantities import quantities
+
+    wavelengths = [float(nm) for nm in parameters.init.wavelengths]
+    fields = [*parameters.fields, *parameters.derived]
+    known = [*fields, *(quantity.name for quantity in quantities(fields, wavelengths))]
+    for name in names:
+        if name not in known:
+            raise InputError(
+                f"profile: got {name!r}{did_you_mean(name, tuple(known))}; expected a number of this fit: {', '.join(fields)}, "
+                "with _<nm> for one wavelength"
+            )
+    return tuple(names)
 
 
 def make_priors(table: Mapping[str, Any], parameters: "Parameters") -> "list[Prior]":
@@ -256,6 +300,9 @@ def run(job: Job, directory: Path, *, overwrite: bool, quiet: bool = False) -> b
         mark = "" if step.accepted else "  (rejected)"
         console.print(f"  step {step.step:3}  reduced χ² {step.reduced_chi2:<10.5g}  {step.seconds:.2f} s{mark}")
 
+    def show_point(name: str, value: float, growth: float) -> None:
+        console.print(f"  {name} = {value:<10.5g}  Δχ² {growth:.3g}")
+
     with console.status("compiling the model and its derivatives, then fitting …"):
         result = fitting.fit(
             job.observations,
@@ -268,8 +315,14 @@ def run(job: Job, directory: Path, *, overwrite: bool, quiet: bool = False) -> b
             progress=show,
             max_steps=job.max_steps,
             refine=job.refine,
+            starts=job.starts,
             checkpoint=file,
         )
+        if job.profile and result.converged:
+            console.print("Profiles:")
+            result = fitting.profile(result, *job.profile, progress=show_point)
+        elif job.profile:
+            console.print("No profiles: they are about an optimum, and none was found.")
         report.write(result, directory, truth=job.truth, overwrite=overwrite)
     if result.message != INTERRUPTED:
         file.unlink(missing_ok=True)

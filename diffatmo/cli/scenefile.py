@@ -85,7 +85,7 @@ PRIOR_KEYS: dict[str, dict[str, Key]] = {
 }
 """The keys of a ``[[prior]]`` by its kind; ``number`` is that of a table without ``kind``."""
 
-SCENE_KEYS = ("init", "free", "tie", "prior", "loss", "model", "max_steps", "image")
+SCENE_KEYS = ("init", "free", "tie", "prior", "loss", "model", "max_steps", "starts", "profile", "image")
 
 
 @dataclass(frozen=True)
@@ -109,6 +109,8 @@ class FitSpec:
     loss: str | None = None
     model: str | None = None
     max_steps: int | None = None
+    starts: int | None = None
+    profile: tuple[str, ...] | None = None
 
     def override(self, **given: Any) -> "FitSpec":
         """This fit with what is not None in ``given`` put in its place."""
@@ -158,14 +160,12 @@ def _scene(data: Mapping[str, Any], directory: Path, least: int) -> FitSpec:
     model = data.get("model")
     if model is not None:
         model = read(Word("How the sky is computed.", MODELS), "model", model)
-    max_steps = data.get("max_steps")
-    if max_steps is not None and (isinstance(max_steps, bool) or not isinstance(max_steps, int) or max_steps < 1):
-        raise InputError(f"max_steps: got {max_steps!r}, expected a whole number of at least 1")
+    max_steps, starts = _count(data, "max_steps"), _count(data, "starts")
     loss = data.get("loss")
     if loss is not None:
         loss = read(Word("What outliers are given.", LOSSES), "loss", loss)
     free, tie, priors = _names(data, "free"), _tie(data.get("tie")), _priors(data.get("prior"))
-    return FitSpec(tuple(images), init, free, tie, priors, loss, model, max_steps)
+    return FitSpec(tuple(images), init, free, tie, priors, loss, model, max_steps, starts, _names(data, "profile"))
 
 
 def _image(table: Mapping[str, Any], directory: Path) -> ImageSpec:
@@ -178,6 +178,13 @@ def _image(table: Mapping[str, Any], directory: Path) -> ImageSpec:
         options["mask"] = str(directory / options["mask"])
     check_image_options(options)
     return ImageSpec(directory / file, options)
+
+
+def _count(data: Mapping[str, Any], key: str) -> int | None:
+    number = data.get(key)
+    if number is not None and (isinstance(number, bool) or not isinstance(number, int) or number < 1):
+        raise InputError(f"{key}: got {number!r}, expected a whole number of at least 1")
+    return number
 
 
 def _names(data: Mapping[str, Any], key: str) -> tuple[str, ...] | None:
