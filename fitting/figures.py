@@ -160,9 +160,13 @@ def profile_figure(profiles: Sequence[Profile]) -> Figure:
 
 
 def _profile_panel(axes: Axes, profile: Profile) -> None:
-    axes.plot(profile.points, profile.delta_chi2, "o-", color="#1f5fa8", markersize=3.5, label="profile")
+    values = np.linspace(profile.points[0], profile.points[-1], 200)
+    # Between the points as the intervals have it: the root, with the sign of the side, is linear.
+    side = np.where(np.arange(len(profile.points)) < np.argmin(profile.delta_chi2), -1, 1)
+    root = np.interp(values, profile.points, side * np.sqrt(np.maximum(profile.delta_chi2, 0)))
+    axes.plot(values, root**2, color="#1f5fa8", label="profile")
+    axes.plot(profile.points, profile.delta_chi2, "o", color="#1f5fa8", markersize=3.5)
     if profile.standard_error:
-        values = np.linspace(profile.points[0], profile.points[-1], 200)
         parabola = ((values - profile.value) / profile.standard_error) ** 2
         axes.plot(values, parabola, "--", color="#888", linewidth=1, label="covariance")
     for level, colour in ((ONE_SIGMA, "#1b7f4b"), (NINETY_FIVE, "#c2571a")):
