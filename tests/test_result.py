@@ -192,7 +192,7 @@ def test_other_files_are_refused(saved):
         assert "saved fit" in refusal(saved, content)
     assert "schema" in refusal(saved, npz(record=text({"schema": "diffatmo-fit"})))
     newer = {"schema": storage.SCHEMA, "schema_version": 3, "version": "9.9", "result": {}}
-    assert "got 2 (diffatmo 9.9), expected 1" in refusal(saved, npz(record=text(newer)))
+    assert "got 3 (diffatmo 9.9), expected 2" in refusal(saved, npz(record=text(newer)))
     for result in ({}, {"chi2": {"type": "os.system"}}, {"model": {"type": "model", "name": "x", "fields": {}}}, 3):
         refusal(saved, npz(record=text(newer | {"schema_version": 2, "result": result})))
     refusal(saved, npz(record=np.array([3.5])))
