@@ -536,8 +536,8 @@ def plan(
     # The program for the images is compiled while that for the shots is.
     ahead = None
     if observations:
-        batch = stack(observations, [float(nm) for nm in atmosphere.wavelengths])
-        ahead = compile_ahead(linearise, parameters.start, _problem(batch, parameters, sky))
+        taken = _problem(stack(observations, [float(nm) for nm in atmosphere.wavelengths]), parameters, sky)
+        ahead = compile_ahead(linearise, taken.start, taken)
     offered = [*chosen, *ranked_only]
     parts = of_shots(offered, parameters, sky, sensor=own_sensor, altitude=level)
     if ahead is not None:

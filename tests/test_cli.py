@@ -306,6 +306,29 @@ def test_fit_of_a_scene_file(tmp_path, s1, start, toy):
     assert (tmp_path / "out" / "profile_mie_g.png").exists()
 
 
+def test_nuisances_of_a_scene_file(tmp_path, s1, start, toy):
+    """A camera turned by 1.5° clockwise, which only a free pose finds; angles are in degrees in the file and in the record."""
+    image = toy_image(tmp_path / "sky.exr", s1, zenith=40)
+    shot = scene.load(image)[1]
+    yaw = math.degrees(float(shot.camera.yaw)) - 1.5
+    (tmp_path / "scene.toml").write_text(
+        f'init = "{start}"\nfree = ["rayleigh_scattering", "mie_g"]\n[[image]]\nfile = "sky.exr"\nyaw_deg = {yaw}\n'
+        'pose = "free"\npose_error_deg = 3\npedestal = "free-per-channel"\nhorizon_exclusion_deg = 10\n'
+    )
+    assert main(["fit", "--config", str(tmp_path / "scene.toml"), "-o", str(tmp_path / "out")]) == 0
+    record = json.loads((tmp_path / "out" / "fit.json").read_text())
+    found = record["nuisances"]
+    assert list(found) == [
+        *("pose_sky_east_deg", "pose_sky_north_deg", "pose_sky_up_deg"),
+        *("pedestal_sky_680", "pedestal_sky_550", "pedestal_sky_440"),
+    ]
+    turn = found["pose_sky_up_deg"]
+    assert turn["value"] == pytest.approx(-1.5, abs=4 * turn["standard_error"])
+    assert turn["standard_error"] < 1
+    assert record["images"][0]["pose"] == "free"
+    assert [prior["error"] for prior in record["priors"]] == pytest.approx([3])
+
+
 def test_options_come_before_the_header(tmp_path, s1, start, toy):
     image = toy_image(tmp_path / "sky.exr", s1, zenith=40)
     options = ["--altitude-km", "3", "--sun-zenith-deg", "50", "--noise", "0.5", "--exposure", "free"]

@@ -148,7 +148,7 @@ LENSES = (Fisheye(8, 8), Pinhole(6, 8, fov_y=1.0, pitch=0.9), Equirectangular(6,
     [
         (Toy(), 0.0, 1, LENSES),
         (Toy(), 40.0, 4, LENSES),
-        (RayMarch(steps=3), 0.0, 1, LENSES[:1]),
+        pytest.param(RayMarch(steps=3), 0.0, 1, LENSES[:1], marks=pytest.mark.slow),
     ],
 )
 def test_jacobian_against_differences(x64, model, zenith, parts, lenses):
@@ -423,6 +423,17 @@ def test_kept_predicted_and_planned(tmp_path):
     focal = names.index("focal_c")
     wanted = found.nuisances[focal]
     assert errors[focal] * 0.05 * wanted.value == pytest.approx(wanted.standard_error / found.error_scale, rel=0.05)
+
+
+def test_a_plan_knows_what_the_images_leave_in_doubt():
+    """With the camera and the sun in doubt the same images tell less, and another shot still tells of the air alone."""
+    shots = fitting.planning.candidates([60 * DEG])[:1]
+    tight, loose = (
+        fitting.planning.plan(images, atmosphere=toy_sky.truth(), free=["mie_g"], shots=shots, count=1, model=Toy())
+        for images in (skewed(), with_free(skewed(), **ALL_FREE))
+    )
+    assert loose.standard_errors[0] > tight.standard_errors[0]
+    assert loose.ranking[0].gain > tight.ranking[0].gain > 1
 
 
 def test_a_checkpoint_belongs_to_one_choice(tmp_path):
