@@ -105,6 +105,7 @@ def stack(observations: Sequence[Observation], wavelengths: Sequence[float]) -> 
         altitude=number([observation.altitude for observation in observations]),
         sun=number(np.stack([observation.sun for observation in observations])),
         directions=directions,
+        # Pixels that are not finite are shown and counted but never used (fitting.observation); 0 * NaN would be NaN.
         measured=jnp.nan_to_num(padded("image", np.float32(0)), posinf=0.0, neginf=0.0),
         used=padded("used", False),
         noise=padded("noise", np.float32(0)),
