@@ -1,21 +1,28 @@
-"""Are the error bars right? Fit the shipped skies with fresh sensor noise many times.
+"""Are the error bars right? Fit the shipped skies many times, every time with fresh paths and fresh sensor noise.
 
 python tests/benchmarks/calibration.py [REALISATIONS] [NAME ...]
 
-The Monte Carlo means are traced anew, a quarter of an hour for a sky, and kept in a folder of the system's temporary files.
-Their own noise is a few tenths of the sensor's where the sky is bright. Realisations have to share it, so each takes every
-channel from another mean: the channels of one mean come from the same paths, and their errors are alike, which no fit expects.
-And the errors of a mean's pixels are taken from the *other* means, as an estimate from a pixel's own paths is large where the
-value is.
+Realisations that share a Monte Carlo mean share its noise, and their mean pull is then that of a few pictures, however many
+they are. So every one is traced anew, with few paths, and the Monte Carlo's own noise is part of what the error bars have to
+cover. A sky takes a quarter of an hour on two cores; what was traced is kept in a folder of the system's temporary files.
+
+The channels of one trace come from the same paths, and their errors are alike, which no fit expects: every channel of a
+realisation comes from another trace, and no channel of a trace is used twice. The noise of a pixel is the scatter of the
+*other* traces there: an estimate from its own paths is large where the value is.
+
+With few paths the error bars are wider than those of the shipped pictures. The last column states the mean error in units of
+those.
 """
 
-import itertools
+import json
+import subprocess
 import sys
 import tempfile
 from pathlib import Path
 
 import numpy as np
 from rich.console import Console
+from rich.progress import track
 from rich.table import Table
 
 import fitting
@@ -23,35 +30,33 @@ import fitting
 sys.path.insert(0, str(Path(__file__).parents[2] / "data_synthetic"))
 import generate
 
-TRACED = 3
-"""Independent Monte Carlo means of every picture."""
-SAMPLES = generate.SAMPLES // 2
+SAMPLES = 128
+"""Paths of a pixel."""
 
 
-def traced(name: str, number: int, zenith_deg: float, k: int) -> tuple[np.ndarray, np.ndarray]:
-    """Mean ``k`` of a picture and its standard error, traced or found."""
-    file = Path(tempfile.gettempdir()) / "diffatmo-calibration" / f"{name}_{zenith_deg:g}_{k}_{SAMPLES}.npz"
+def traced(name: str, number: int, k: int) -> np.ndarray:
+    """Trace ``k`` of a picture, made or found."""
+    file = Path(tempfile.gettempdir()) / "diffatmo-calibration" / f"{name}_{number}_{k}_{SAMPLES}.npy"
     if not file.exists():
         file.parent.mkdir(exist_ok=True)
-        mean, error = generate.trace(generate.ATMOSPHERES[name], zenith_deg, 5000 + 100 * k + number, SAMPLES)
-        np.savez(file, mean=mean, error=error)
-    with np.load(file) as found:
-        return found["mean"], found["error"]
+        sun, seed = generate.SUN_ZENITH_DEG[number], 5000 + 10 * k + number
+        mean, _ = generate.trace(generate.ATMOSPHERES[name], sun, seed, SAMPLES)
+        with file.with_suffix(".part").open("wb") as part:
+            np.save(part, mean.astype(np.float32))
+        file.with_suffix(".part").rename(file)
+    return np.load(file).astype(float)
 
 
-def realisation(means: list[list[tuple[np.ndarray, np.ndarray]]], truth, seed: int) -> fitting.FitResult:
-    """Fit one exposure of every picture, each channel from another of its ``means``."""
-    orders = list(itertools.permutations(range(TRACED), 3))
-    order = orders[seed % len(orders)]
+def realisation(traces: list[np.ndarray], truth, seed: int) -> fitting.FitResult:
+    """Fit one exposure of every picture; ``traces`` of a picture have the shape (realisation, height, width, channel)."""
     observations = []
     for number, zenith_deg in enumerate(generate.SUN_ZENITH_DEG):
-        ways = [means[k][number] for k in range(TRACED)]
-        mean = np.stack([ways[k][0][..., channel] for channel, k in enumerate(order)], axis=-1)
-        squares = [(error / value) ** 2 for value, error in ways]
-        others = [
-            np.mean([squares[other][..., channel] for other in range(TRACED) if other != k], axis=0)
-            for channel, k in enumerate(order)
-        ]
+        every = traces[number]
+        count = len(every)
+        apart = [(seed + channel * count // every.shape[-1]) % count for channel in range(every.shape[-1])]
+        mean = np.stack([every[k, ..., channel] for channel, k in enumerate(apart)], axis=-1)
+        others = [np.delete(every[..., channel], k, axis=0) for channel, k in enumerate(apart)]
+        relative = np.stack([other.std(axis=0, ddof=1) / other.mean(axis=0) for other in others], axis=-1)
         image, gain = generate.expose(mean, 1000 * seed + number)
         observations.append(
             fitting.observe(
@@ -59,7 +64,7 @@ def realisation(means: list[list[tuple[np.ndarray, np.ndarray]]], truth, seed: i
                 camera=generate.camera(),
                 altitude=generate.ALTITUDE_KM,
                 sun=generate.towards(zenith_deg),
-                noise=np.sqrt(np.stack(others, axis=-1)),
+                noise=relative,
                 noise_shot=1 / gain,
                 noise_floor=generate.READ / gain,
                 sun_exclusion=np.radians(2.0),
@@ -70,18 +75,42 @@ def realisation(means: list[list[tuple[np.ndarray, np.ndarray]]], truth, seed: i
     return fitting.fit(observations, init=truth, free=generate.FREE, tie=generate.TIE).with_truth(truth)
 
 
+def shipped_bars(name: str) -> list[float]:
+    """Standard errors of the fit of the shipped pictures."""
+    scene = Path(generate.__file__).parent / name / "scene.toml"
+    with tempfile.TemporaryDirectory() as directory:
+        out = Path(directory) / "fit"
+        subprocess.run([sys.executable, "-m", "diffatmo", "fit", scene, "-o", out], check=True, capture_output=True)
+        found = json.loads((out / "fit.json").read_text())
+    return [estimate["standard_error"] for estimate in found["parameters"]]
+
+
 def main(count: int, names: list[str]) -> None:
     for name in names:
         truth = generate.ATMOSPHERES[name]
-        suns = list(enumerate(generate.SUN_ZENITH_DEG))
-        means = [[traced(name, number, sun, k) for number, sun in suns] for k in range(TRACED)]
-        results = [realisation(means, truth, seed) for seed in range(count)]
-        table = Table("parameter", "mean pull", "its scatter", title=f"{name}: {count} realisations of the noise")
-        for number, estimate in enumerate(results[0].parameters):
+        ways = [(number, k) for k in range(count) for number in range(len(generate.SUN_ZENITH_DEG))]
+        found = {way: traced(name, *way) for way in track(ways, f"{name}: paths")}
+        traces = [np.stack([found[number, k] for k in range(count)]) for number in range(len(generate.SUN_ZENITH_DEG))]
+        results = [realisation(traces, truth, seed) for seed in track(range(count), f"{name}: fits")]
+        table = Table(
+            "parameter",
+            "mean pull",
+            "its scatter",
+            "mean error / shipped error bar",
+            title=f"{name}: {count} realisations, χ² {np.mean([r.reduced_chi2 for r in results]):.3f}",
+        )
+        for number, (estimate, bar) in enumerate(zip(results[0].parameters, shipped_bars(name), strict=True)):
             pulls = np.array([result.parameters[number].pull for result in results])
-            table.add_row(estimate.name, f"{pulls.mean():+.2f}", f"{pulls.std(ddof=1):.2f}")
+            errors = np.array([result.parameters[number].value - estimate.truth for result in results]) / bar
+            uncertain = errors.std(ddof=1) / np.sqrt(count)
+            table.add_row(
+                estimate.name,
+                f"{pulls.mean():+.2f}",
+                f"{pulls.std(ddof=1):.2f}",
+                f"{errors.mean():+.2f} ± {uncertain:.2f}",
+            )
         Console().print(table)
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 50, sys.argv[2:] or list(generate.ATMOSPHERES))
+    main(int(sys.argv[1]) if len(sys.argv) > 1 else 48, sys.argv[2:] or list(generate.ATMOSPHERES))
