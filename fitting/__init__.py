@@ -18,7 +18,7 @@ from fitting.prediction import Prediction
 from fitting.priors import Prior
 from fitting.profiles import profile
 from fitting.result import FitResult
-from fitting.solve import Step
+from fitting.search import Step
 from fitting.uncertainty import fit
 
 __all__ = [

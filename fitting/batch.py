@@ -1,5 +1,6 @@
 """Several observations in arrays of one shape, so that one program sees them all."""
 
+import math
 from collections import Counter
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -7,12 +8,19 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Float
 
 from diffatmo.camera import Camera
 from fitting._errors import FitError
 from fitting.nuisances import FOCAL, OFFSETS, POSE, SUN, Nuisances, displace, gather, rotate, sun_axes
 from fitting.observation import FIXED, Observation
+
+PIXEL_FIELDS = ("directions", "measured", "used", "noise", "noise_shot", "noise_floor")
+"""What a :class:`Batch` has for every pixel."""
+
+TILE = 8192
+"""Pixels of a tile at most: their derivatives with respect to ten parameters take some hundred megabytes."""
 
 
 class Views(NamedTuple):
@@ -40,6 +48,10 @@ class Batch(eqx.Module):
     sun_axes: Float[Array, "image 2 3"]
     cameras: tuple[Camera | None, ...]
     """Those whose focal length is free; empty if none is."""
+    tiles: int = eqx.field(static=True, default=1)
+    """Into how many tiles the pixels of an image go, on each device."""
+    mesh: Mesh | None = eqx.field(static=True, default=None)
+    """The devices that share out the pixels, if there are several."""
 
     def exposure(self, linear: Float[Array, " k"]) -> Float[Array, "image 1 w"]:
         """What radiance is multiplied by."""
@@ -65,8 +77,8 @@ class Batch(eqx.Module):
         )
 
 
-def stack(observations: Sequence[Observation], wavelengths: Sequence[float]) -> Batch:
-    """The observations as one batch; raises :class:`FitError` if they do not go together."""
+def stack(observations: Sequence[Observation], wavelengths: Sequence[float], mesh: Mesh | None = None) -> Batch:
+    """The observations as one batch, for the devices of ``mesh``; raises :class:`FitError` if they do not go together."""
     if not observations:
         raise FitError("no observation was given")
     seen = Counter(observation.name for observation in observations)
@@ -81,7 +93,9 @@ def stack(observations: Sequence[Observation], wavelengths: Sequence[float]) -> 
                 f"{observation.name}: the image has {channels} channels, expected {len(wavelengths)}, one for each "
                 f"wavelength of the atmosphere ({given} nm)"
             )
-    size = max(int(observation.shown.sum()) for observation in observations)
+    most, devices = max(int(observation.shown.sum()) for observation in observations), 1 if mesh is None else mesh.size
+    tiles = math.ceil(most / (devices * TILE))
+    size = devices * tiles * math.ceil(most / (devices * tiles))
 
     def padded(field: str, fill: Any) -> Array:
         rows = []
@@ -115,4 +129,6 @@ def stack(observations: Sequence[Observation], wavelengths: Sequence[float]) -> 
         nuisances=gather(observations, wavelengths)[1],
         sun_axes=number(np.stack([sun_axes(observation.sun) for observation in observations])),
         cameras=cameras if any(cameras) else (),
+        tiles=tiles,
+        mesh=mesh,
     )

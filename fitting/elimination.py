@@ -1,11 +1,11 @@
 """Factors and pedestals, eliminated: given the radiance of the model, their optimum follows.
 
 *The optimum.* A pixel is e L + b, with the radiance L, a factor e and a pedestal b of its image and channel. However many
-pixels there are, χ² as a function of e and b is held by the triangular factor of [L 1 d] / sigma, d the measured pixels: three
-by three numbers for each image and channel (:func:`channel_factors`). From them the optimum of all factors and pedestals is
+pixels there are, χ² as a function of e and b is held by the triangular factor of [L 1 d] / sigma, d the measured pixels: a few
+numbers for each image and channel, part of the rows of a linearisation. From them the optimum of all factors and pedestals is
 found at once, whichever images and channels share them. The logarithms of shared factors add up, which is not linear in them:
-a few steps of Gauss and Newton are taken, each of which costs nothing (:func:`optimum`). A robust loss changes the weights with
-the optimum, so the pixels are gone through again until neither changes.
+a few steps of Gauss and Newton are taken, each of which costs nothing (:func:`optimum`). The weights of a robust loss are held;
+:mod:`fitting.search` goes through the pixels again where they change much.
 
 *The step.* With the linear coordinates at their optimum wherever χ² is evaluated, the fit is one in the others, x, alone: of
 the smallest χ² that any factors and pedestals allow. Its Gauss-Newton step needs the derivatives of the residuals less what the
@@ -23,13 +23,13 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from diffatmo.compiling import outermost
 from fitting.batch import Batch
+from fitting.linearisation import Linearisation
 from fitting.nuisances import Nuisances
 from fitting.parameters import Coordinates
-from fitting.residuals import Linearisation, Problem, whitened
+from fitting.problem import Problem
 
 RANK_TOLERANCE = 3e-5
 """Singular values of J, scaled to columns of length one, below this are rounding: J is computed in float32."""
@@ -41,26 +41,19 @@ REACH = 3.0
 """Change of such a logarithm beyond which an optimum is not followed: where the model is the image's negative, no factor is
 small enough."""
 
-ROUNDS = 30
-"""Of new weights, at most."""
-
 SETTLED = 1e-3
 """Fall of χ² below which the optimum is found."""
 
 
-def channel_factors(y: Coordinates, linearisation: Linearisation, problem: Problem) -> Float[Array, "image w rows 3"]:
-    """The triangular factor of [radiance, 1, measured] / sigma of every image and channel, in the known part of the exposure.
-
-    The weights of a robust loss are those at ``y``.
-    """
-    batch, weight = problem.batch, problem.weight
-    if problem.loss is not None:
-        robust, _ = problem.loss(whitened(y, linearisation, problem))
-        weight = weight * jnp.sqrt(robust)[..., None]
-    lit = linearisation.radiance * batch.exposure_value[:, None, None]
-    columns = jnp.stack([lit, jnp.ones_like(lit), batch.measured], axis=-1) * weight[..., None]
-    columns = jnp.where(batch.used[..., None, None], columns, 0)
-    return jnp.linalg.qr(jnp.swapaxes(columns, 1, 2), mode="r")
+def channel_columns(linearisation: Linearisation, problem: Problem) -> Float[np.ndarray, "image w rows 3"]:
+    """Rows of [radiance, 1, measured] / sigma of every image and channel, in the known part of the exposure."""
+    linear, batch = linearisation.linear, problem.batch
+    rows = np.asarray(linearisation.rows, dtype=np.float64)
+    known = np.asarray(batch.exposure_value, dtype=np.float64)[:, None, None]
+    of_channel = lambda values: np.swapaxes(np.asarray(values, dtype=np.float64), 1, 2)
+    lit, one = known * rows[..., -3], rows[..., -2]
+    factor, pedestal = (of_channel(of(linear)) for of in (batch.nuisances.factor, batch.nuisances.pedestal))
+    return np.stack([lit, one, factor * lit + pedestal * one - rows[..., -1]], axis=-1)
 
 
 class _Curve(NamedTuple):
@@ -75,13 +68,13 @@ class _Curve(NamedTuple):
 
 
 def optimum(
-    linear: Float[np.ndarray, " k"], factors: Float[np.ndarray, "image w rows 3"], nuisances: Nuisances
+    linear: Float[np.ndarray, " k"], columns: Float[np.ndarray, "image w rows 3"], nuisances: Nuisances
 ) -> tuple[Float[np.ndarray, " k"], float]:
     """The linear coordinates of the smallest χ², from ``linear`` on, and by how much it has fallen."""
     numbers = np.arange(nuisances.factors)
     in_factor = np.sum(np.asarray(nuisances.factor_index)[..., None] == numbers, axis=-2)
     in_pedestal = np.asarray(nuisances.pedestal_index)[..., None] == np.arange(nuisances.pedestals)
-    lit, black, measured = np.moveaxis(factors, -1, 0)
+    lit, black, measured = np.moveaxis(columns, -1, 0)
 
     def at(linear: Float[np.ndarray, " k"]) -> _Curve:
         factor = np.exp(in_factor @ linear[: nuisances.factors])[..., None]
@@ -117,19 +110,12 @@ def optimum(
 def eliminate(y: Coordinates, linearisation: Linearisation, problem: Problem) -> Coordinates:
     """``y`` with its linear coordinates at the optimum for the radiance of ``linearisation``."""
     nuisances = problem.batch.nuisances
-    if not nuisances.linear:
+    columns = channel_columns(linearisation, problem) if nuisances.linear else np.zeros(0)
+    if not (nuisances.linear and np.all(np.isfinite(columns))):
         return y
     x, linear = problem.split(y)
-    for _ in range(1 if problem.loss is None else ROUNDS):
-        factors = np.asarray(outermost(channel_factors)(y, linearisation, problem), dtype=np.float64)
-        if not np.all(np.isfinite(factors)):
-            return y
-        better, fall = optimum(np.asarray(linear, dtype=np.float64), factors, nuisances)
-        linear = jnp.asarray(better, y.dtype)
-        y = jnp.concatenate([x, linear])
-        if fall < SETTLED:
-            break
-    return y
+    better, _ = optimum(np.asarray(linear, dtype=np.float64), columns, nuisances)
+    return jnp.concatenate([x, jnp.asarray(better, y.dtype)])
 
 
 def starting(radiance: np.ndarray, batch: Batch) -> Float[np.ndarray, " k"]:

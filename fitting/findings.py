@@ -19,7 +19,7 @@ from fitting.nuisances import channel_names
 from fitting.observation import Observation, sigma
 from fitting.priors import Prior
 from fitting.quantities import numbers
-from fitting.solve import Step
+from fitting.search import Step
 
 ONE_SIGMA, NINETY_FIVE = 0.6827, 0.95
 """Probabilities of intervals."""

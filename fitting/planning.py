@@ -30,7 +30,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from diffatmo import transmittance
 from diffatmo.atmosphere import Atmosphere
@@ -41,21 +41,14 @@ from diffatmo.numerics import safe_log
 from fitting._errors import FitError
 from fitting.batch import Batch, stack
 from fitting.elimination import eliminate, starting, without
+from fitting.least_squares import known_rows, slopes, triangle
+from fitting.linearisation import derivatives, linearise
 from fitting.nuisances import gather
 from fitting.observation import FIXED, NOISE, PER_CHANNEL, Observation, observe, sigma
 from fitting.parameters import Coordinates, Parameters, select
+from fitting.problem import Problem, light, planet_shell, weights
 from fitting.quantities import DERIVED, Quantity, numbers, quantities
-from fitting.residuals import (
-    Linearisation,
-    Predicted,
-    Problem,
-    jacobian,
-    light,
-    linearise,
-    planet_shell,
-    prior_rows,
-    triangle,
-)
+from fitting.solve import evaluated, pose
 from fitting.uncertainty import propagate
 
 VAGUE = 3.0
@@ -221,36 +214,15 @@ def _compact(factor: Float[np.ndarray, "rows n"]) -> Float[np.ndarray, "rows n"]
     return np.asarray(np.linalg.qr(factor, mode="r")) if factor.shape[0] > factor.shape[1] else factor
 
 
-def _reduce(y: Coordinates, linearisation: Linearisation, problem: Problem) -> Float[Array, "n n"]:
-    _, slope = jacobian(y, linearisation, problem)
+def _information(
+    y: Coordinates, columns: Float[np.ndarray, "image w row k"], problem: Problem, names: Sequence[str]
+) -> Information:
+    """That of images of which these are the columns of the whitened residuals, and of what is known besides."""
+    slope = slopes(y, columns, problem).reshape(-1, y.size)
     if problem.known:
-        slope = jnp.concatenate([slope, prior_rows(y, problem)[1]])
-    return triangle(jnp.zeros_like(slope[:, 0]), slope)[:-1, :-1]
-
-
-def _information(y: Coordinates, linearisation: Linearisation, problem: Problem, names: Sequence[str]) -> Information:
-    """That of the images of ``problem``, whose weights are known."""
-    factor = np.asarray(outermost(_reduce)(y, linearisation, problem), dtype=np.float64)
+        slope = np.concatenate([slope, known_rows(y, problem)[1]])
+    factor = triangle(np.zeros(len(slope)), slope)[:-1, :-1]
     return Information(tuple(names), np.roll(factor, len(names), axis=1))
-
-
-def _problem(batch: Batch, parameters: Parameters, model: Model) -> Problem:
-    """The problem of images whose weights are not known yet."""
-    # With a correction, although it is one, as then a fit of the same images has compiled the same program.
-    ones = jnp.ones_like(batch.measured)
-    return Problem(model, parameters, batch, ones, outermost(planet_shell)(model, parameters), ones)
-
-
-def _linearised(problem: Problem, names: Sequence[str]) -> Linearisation:
-    """The model and its derivatives in all pixels of the images called ``names``."""
-    found = jax.block_until_ready(outermost(linearise)(problem.start, problem))
-    used = np.asarray(problem.batch.used)
-    for values, what in ((found.radiance, "radiance"), (found.tangents, "derivatives")):
-        bad = used & ~np.isfinite(np.asarray(values)).all(axis=tuple(range(2, values.ndim)))
-        for name, count in zip(names, bad.sum(axis=1), strict=True):
-            if count:
-                raise FitError(f"{name}: the model's {what} are not finite in {count} of the pixels used")
-    return found
 
 
 def of_observations(observations: Sequence[Observation], parameters: Parameters, model: Model) -> Information:
@@ -260,17 +232,22 @@ def of_observations(observations: Sequence[Observation], parameters: Parameters,
     wavelengths = [float(nm) for nm in parameters.init.wavelengths]
     batch = stack(observations, wavelengths)
     labels, _ = gather(observations, wavelengths)
-    problem = _weighed(_problem(batch, parameters, model), batch.measured)
-    found = _linearised(problem, [o.name for o in observations])
+    problem = pose(batch, parameters, (), None, model)
+    problem = replace(problem, shell=outermost(planet_shell)(model, parameters))
+    found = evaluated(problem.start, jnp.zeros(batch.nuisances.linear, problem.start.dtype), problem)
+    _check_finite(np.asarray(found.bad), [observation.name for observation in observations])
     linear = jnp.asarray(starting(np.asarray(found.radiance), batch), problem.start.dtype)
     y = eliminate(jnp.concatenate([problem.start, linear]), found, problem)
-    problem = _weighed(problem, light(y, found, problem))
-    return _information(y, found, problem, [label.name for label in labels])
+    problem = replace(problem, weight=weights(batch, light(y, found.radiance, problem)))
+    found = evaluated(*problem.split(y), problem)
+    return _information(y, np.asarray(found.rows, float), problem, [label.name for label in labels])
 
 
-def _weighed(problem: Problem, light: Predicted) -> Problem:
-    """``problem`` with the weights of pixels whose signal is ``light``."""
-    return replace(problem, weight=jnp.where(problem.batch.used[..., None], 1 / sigma(problem.batch, light), 0))
+def _check_finite(bad: Int[np.ndarray, "image 2"], names: Sequence[str]) -> None:
+    for what, counts in zip(("radiance", "derivatives"), bad.T, strict=True):
+        for name, lost in zip(names, counts, strict=True):
+            if lost:
+                raise FitError(f"{name}: the model's {what} are not finite in {lost} of the pixels used")
 
 
 def of_shots(
@@ -287,8 +264,14 @@ def of_shots(
     wavelengths = [float(nm) for nm in parameters.init.wavelengths]
     if frames:
         images = [replace(frame, name=f"{frame.name} {number}") for number, frame in enumerate(frames.values())]
-        problem = _problem(stack(images, wavelengths), parameters, model)
-        found = _linearised(problem, [frame.name for frame in frames.values()])
+        problem = pose(stack(images, wavelengths), parameters, (), None, model)
+        # Each photo will have weights of its own.
+        problem = replace(problem, shell=outermost(planet_shell)(model, parameters), correction=None, fields=None)
+        found = jax.tree.map(np.asarray, outermost(derivatives)(problem.start, problem))
+        lost = [~np.isfinite(values).reshape(*values.shape[:2], -1).all(axis=-1) for values in found]
+        used = np.asarray(problem.batch.used)
+        bad = np.stack([np.sum(used & values, axis=1) for values in lost], axis=-1)
+        _check_finite(bad, [frame.name for frame in frames.values()])
     result = []
     for shot in shots:
         if isinstance(shot, Photo):
@@ -298,11 +281,12 @@ def of_shots(
                 [replace(frames[shot.view], name=shot.name, exposure=shot.exposure)], wavelengths
             )
             own = replace(own, nuisances=nuisances)
-            seen = Linearisation(found.radiance[row], found.tangents[row])
-            weight = _weight(shot, seen.radiance, own, sensor)
-            alone = replace(problem, batch=own, weight=weight, correction=None)
+            radiance = found.radiance[row].astype(np.float64)
+            known = [found.tangents[row], radiance[..., None], *[np.ones_like(radiance)[..., None]] * 2]
+            columns = np.concatenate(known, axis=-1) * _weight(shot, radiance, own, sensor)[..., None]
             y = jnp.concatenate([problem.start, jnp.zeros(nuisances.linear, problem.start.dtype)])
-            part = _information(y, seen, alone, [label.name for label in labels])
+            alone = replace(problem, batch=own)
+            part = _information(y, np.swapaxes(columns, 1, 2), alone, [label.name for label in labels])
         else:
             part = _disc_information(shot, parameters, sensor, altitude)
         result.append(part)
@@ -324,18 +308,19 @@ def _frame(photo: Photo, atmosphere: Atmosphere, sensor: Sensor, altitude: float
     )
 
 
-def _weight(photo: Photo, radiance: Predicted, batch: Batch, sensor: Sensor) -> Predicted:
+def _weight(
+    photo: Photo, light: Float[np.ndarray, "image pixel w"], batch: Batch, sensor: Sensor
+) -> Float[np.ndarray, "image pixel w"]:
     """1/sigma of the pixels of one photo; 0 of those saturated, dark, or not in the sky."""
-    light = np.asarray(radiance, dtype=np.float64)
     used = np.asarray(batch.used) & (light > 0).all(axis=-1)
     if not used.any():
-        return jnp.zeros_like(radiance)
+        return np.zeros_like(light)
     median, dark = np.median(light[used]), 0.0
     if not photo.bracketed:
         used &= (light <= sensor.brightest * median).all(axis=-1)
         dark = sensor.darkest * median
     deviation = np.asarray(batch.noise) * np.hypot(light, dark)
-    return jnp.asarray(np.where(used[..., None], 1 / np.where(deviation > 0, deviation, np.inf), 0), radiance.dtype)
+    return np.where(used[..., None], 1 / np.where(deviation > 0, deviation, np.inf), 0)
 
 
 def _log_direct(y: Coordinates, parameters: Parameters, altitude: Array, mu_s: Array) -> Float[Array, " w"]:
@@ -536,8 +521,9 @@ def plan(
     # The program for the images is compiled while that for the shots is.
     ahead = None
     if observations:
-        taken = _problem(stack(observations, [float(nm) for nm in atmosphere.wavelengths]), parameters, sky)
-        ahead = compile_ahead(linearise, taken.start, taken)
+        batch = stack(observations, [float(nm) for nm in atmosphere.wavelengths])
+        taken = pose(batch, parameters, (), None, sky)
+        ahead = compile_ahead(linearise, taken.start, jnp.zeros(batch.nuisances.linear, taken.start.dtype), taken)
     offered = [*chosen, *ranked_only]
     parts = of_shots(offered, parameters, sky, sensor=own_sensor, altitude=level)
     if ahead is not None:

@@ -16,7 +16,6 @@ alone makes of them, which are the misfit and the errors of the model. Where Ï‡Â
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -28,13 +27,16 @@ from jaxtyping import Array, Float
 from diffatmo.compiling import outermost
 from fitting._errors import FitError
 from fitting.findings import Estimate, Profile
+from fitting.least_squares import known_rows, reduce
+from fitting.linearisation import Linearisation
 from fitting.nuisances import assumed
 from fitting.parameters import Coordinates, select
 from fitting.priors import Prior, Priors, collect
+from fitting.problem import Linear, Problem, whitened
 from fitting.quantities import numbers
-from fitting.residuals import Linearisation, Problem, linearise, prior_rows, reduce, whitened
 from fitting.result import FitResult
-from fitting.solve import INTERRUPTED, Point, minimise, restored
+from fitting.search import INTERRUPTED, minimise
+from fitting.solve import evaluated, restored
 from fitting.uncertainty import propagate
 
 POINTS = 13
@@ -155,7 +157,7 @@ def _held(optimum: _Optimum, name: str, target: float, error: float) -> Problem:
 def _alone(optimum: _Optimum, name: str) -> float | None:
     """Standard error of a number by the noise as it turned out, without errors of the model; None if it has none."""
     free = replace(optimum.problem, priors=collect(optimum.priors, optimum.problem.parameters))
-    factor = np.asarray(outermost(reduce)(optimum.y, optimum.linearisation, free), dtype=np.float64)[:-1, :-1]
+    factor = reduce(optimum.y, optimum.linearisation, free)[:-1, :-1]
     priors = _held(optimum, name, 0.0, 1.0).priors
     assert priors is not None
     gradient = np.asarray(outermost(_gradient)(optimum.y, priors, optimum.problem), dtype=np.float64)
@@ -165,10 +167,10 @@ def _alone(optimum: _Optimum, name: str) -> float | None:
 
 def _chi2(y: Coordinates, linearisation: Linearisation, problem: Problem) -> float:
     """That of the images and of the priors but for the last, in double precision as far as it is a sum of squares."""
-    off = np.asarray(outermost(whitened)(y, linearisation, problem), dtype=np.float64)
+    off = np.asarray(outermost(whitened)(y, linearisation.radiance, problem), dtype=np.float64)
     of_images = float(np.sum(off**2)) if problem.loss is None else float(problem.loss(jnp.asarray(off, y.dtype))[1])
     assert problem.priors is not None
-    known = np.asarray(outermost(prior_rows)(y, problem)[0], dtype=np.float64)
+    known = known_rows(y, problem)[0]
     # The offsets' come after the priors'.
     return of_images + float(np.sum(np.delete(known, problem.priors.value.size - 1) ** 2))
 
@@ -235,13 +237,18 @@ def _next(walk: list[_Value], target: float, problem: Problem, optimum: _Optimum
         x, linear = problem.split(y)
         y = jnp.concatenate([jnp.clip(x, *problem.limits), linear])
 
-    def evaluate(x: Coordinates, _: Problem) -> Linearisation:
+    def evaluate(x: Coordinates, linear: Linear, _: Problem) -> Linearisation:
         # The priors do not matter to the model, whose program of the fit is used again.
-        return jax.block_until_ready(outermost(linearise)(x, optimum.problem))
+        return evaluated(x, linear, optimum.problem)
 
-    search: Callable[[Coordinates, Linearisation], Point] = partial(
-        minimise,
-        problem=held,
+    start = evaluate(*problem.split(y), held)
+    if np.asarray(start.bad).any():
+        y = walk[-1].y
+        start = evaluate(*problem.split(y), held)
+    point = minimise(
+        y,
+        held,
+        start=start,
         evaluate=evaluate,
         tolerance=TOLERANCE,
         max_steps=STEPS,
@@ -249,11 +256,6 @@ def _next(walk: list[_Value], target: float, problem: Problem, optimum: _Optimum
         progress=None,
         keep=lambda *_: None,
     )
-    start = evaluate(problem.split(y)[0], held)
-    if not np.isfinite(np.asarray(start.tangents)[np.asarray(problem.batch.used)]).all():
-        y = walk[-1].y
-        start = evaluate(problem.split(y)[0], held)
-    point = search(y, start)
     if point.message == INTERRUPTED:
         raise KeyboardInterrupt
     return _valued(point.y, point.linearisation, held, settled=point.converged)

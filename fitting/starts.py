@@ -23,10 +23,10 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from diffatmo.compiling import outermost
-from fitting.batch import Batch
+from fitting.batch import PIXEL_FIELDS, Batch
 from fitting.elimination import starting
 from fitting.parameters import Aerosol, Block, Coordinates, Parameters, Single
-from fitting.residuals import Predicted, Problem, predict
+from fitting.problem import Predicted, Problem, predict
 
 FACTORS: dict[str, float] = {
     "mie_scattering": 5.0,
@@ -108,8 +108,9 @@ def thinned(batch: Batch, count: int = PIXELS) -> tuple[Batch, Int[np.ndarray, "
     size = int(min(count, used.sum(axis=1).max()))
     chosen = np.stack([np.flatnonzero(row)[np.linspace(0, row.sum() - 1, size).astype(int)] for row in used])
     image = np.arange(len(used))[:, None]
-    names = ("directions", "measured", "used", "noise", "noise_shot", "noise_floor")
-    return replace(batch, **{name: getattr(batch, name)[image, chosen] for name in names}), chosen
+    return replace(
+        batch, tiles=1, mesh=None, **{name: getattr(batch, name)[image, chosen] for name in PIXEL_FIELDS}
+    ), chosen
 
 
 def radiances(points: Float[Array, "s n"], problem: Problem) -> Float[Array, "s image p w"]:
@@ -133,7 +134,9 @@ def ranked(problem: Problem) -> list[Float[np.ndarray, " n"]]:
     points = grid(problem.parameters)
     batch, chosen = thinned(problem.batch)
     image = np.arange(len(chosen))[:, None]
-    thin = replace(problem, batch=batch, weight=problem.weight[image, chosen], correction=None, priors=None, loss=None)
+    thin = replace(
+        problem, batch=batch, weight=problem.weight[image, chosen], correction=None, priors=None, loss=None, fields=None
+    )
     found = np.asarray(
         outermost(radiances)(jnp.asarray(points, problem.parameters.start.dtype), thin), dtype=np.float64
     )

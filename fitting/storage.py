@@ -30,7 +30,7 @@ from fitting._errors import FitError
 from fitting.findings import Estimate, Findings, Minimum, Profile, Setup
 from fitting.observation import Observation
 from fitting.priors import Prior
-from fitting.solve import Step
+from fitting.search import Step
 
 SCHEMA, SCHEMA_VERSION = "diffatmo-result", 2
 

@@ -37,7 +37,8 @@ from fitting.parameters import Coordinates, Parameters
 from fitting.priors import Prior
 from fitting.quantities import numbers, quantities
 from fitting.result import FitResult
-from fitting.solve import MAX_STEPS, TOLERANCE, Progress, Solution, solve
+from fitting.search import Progress
+from fitting.solve import MAX_STEPS, TOLERANCE, Solution, solve
 
 
 def propagate(
@@ -210,6 +211,7 @@ def fit(
     refine: bool = True,
     starts: int | None = None,
     checkpoint: Path | None = None,
+    devices: Sequence[jax.Device] | None = None,
 ) -> FitResult:
     """Recover an atmosphere's parameters from images of its sky, with error bars.
 
@@ -235,6 +237,8 @@ def fit(
             there after 40 steps. Several distinct minima, if there are, are in ``minima``.
         checkpoint: A file that holds the best point after every step, and from which the same fit goes on if it exists. It
             is left for the caller to remove.
+        devices: Those that share out the pixels, ``jax.devices()`` by default: all of this machine, or of all processes of
+            ``jax.distributed``, each of which has to make the same call.
 
     Returns:
         The best point found; ``converged`` and ``message`` say whether it is the optimum and why the fit stopped.
@@ -258,5 +262,6 @@ def fit(
         refine=refine,
         starts=starts,
         checkpoint=checkpoint,
+        devices=devices,
     )
     return summarise(solution, observations, model, priors=priors, refine=refine, free=free, tie=tie, loss=loss)

@@ -1,19 +1,27 @@
 """Whitened residuals, and the coloured Jacobian against the plain one."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import plain_residuals
 import pytest
 import toy_sky
+from plain_residuals import residuals
 
 from diffatmo.models import RayMarch
 from fitting.batch import stack
+from fitting.least_squares import jacobian, pushes, triangle
+from fitting.linearisation import linearise
 from fitting.observation import sigma
 from fitting.parameters import select
-from fitting.residuals import Problem, jacobian, light, linearise, projected, residuals, smooth_fields, triangle
+from fitting.problem import Problem, light, predict
+from fitting.smooth import Fields
 
 NM = [680.0, 550.0, 440.0]
+TIE = {"mie_absorption": "start"}
 
 
 def problem(model, free, tie=None, exposure=("fixed", "fixed"), pixels=40):
@@ -31,19 +39,31 @@ def problem(model, free, tie=None, exposure=("fixed", "fixed"), pixels=40):
     return Problem(model, parameters, batch, weight), y
 
 
-@eqx.filter_jit
-def both(y, ours):
-    return jacobian(y, linearise(ours.split(y)[0], ours), ours)
-
-
 @pytest.mark.parametrize("tie", [{"mie_absorption": "start"}, {"mie": "angstrom", "rayleigh_scattering": "lambda^-4"}])
 def test_coloured_jacobian_is_the_jacobian(x64, tie):
     ours, y = problem(toy_sky.Toy(), toy_sky.FREE, tie=tie, exposure=("free", "lens-per-channel"))
     assert ours.batch.nuisances.factors == 4
-    residual, coloured = both(y, ours)
-    np.testing.assert_allclose(residual, eqx.filter_jit(residuals)(y, ours), rtol=1e-12)
     plain = eqx.filter_jit(jax.jacfwd(residuals))(y, ours)
-    np.testing.assert_allclose(coloured, plain, atol=1e-10 * np.abs(plain).max())
+    np.testing.assert_allclose(plain_residuals.jacobian(y, ours), plain, atol=1e-10 * np.abs(plain).max())
+
+
+@pytest.mark.parametrize("tiles", [1, 3])
+def test_rows_hold_the_sums_over_all_pixels(x64, tiles):
+    """χ², gradient and JᵀJ, however many tiles, for the nuisances of the linearisation and for others."""
+    ours, y = problem(toy_sky.Toy(), toy_sky.FREE, tie=TIE, exposure=("free", "lens-per-channel"), pixels=45)
+    assert ours.batch.measured.shape[1] % 3 == 0
+    ours = eqx.tree_at(lambda p: p.batch, ours, dataclasses.replace(ours.batch, tiles=tiles))
+    x, linear = ours.split(y)
+    plain, slope = eqx.filter_jit(residuals)(y, ours), eqx.filter_jit(jax.jacfwd(residuals))(y, ours)
+    for before in (linear, linear + jnp.array([0.3, -0.2, 0.1, 0.0])):
+        found = eqx.filter_jit(linearise)(x, before, ours)
+        residual, rows = jacobian(y, found, ours)
+        assert rows.size < slope.size
+        assert residual @ residual == pytest.approx(float(plain @ plain), rel=1e-10)
+        np.testing.assert_allclose(
+            rows.T @ residual, slope.T @ plain, rtol=1e-8, atol=1e-8 * np.abs(slope.T @ plain).max()
+        )
+        np.testing.assert_allclose(rows.T @ rows, slope.T @ slope, rtol=1e-8, atol=1e-9 * np.abs(slope.T @ slope).max())
 
 
 def test_wavelengths_do_not_mix_in_a_real_model():
@@ -64,17 +84,20 @@ def test_wavelengths_do_not_mix_in_a_real_model():
 
 def test_one_tangent_for_each_field():
     ours, y = problem(toy_sky.Toy(), toy_sky.FREE)
-    assert eqx.filter_eval_shape(linearise, y, ours).tangents.shape[-1] == len(toy_sky.FREE)
+    rows = eqx.filter_eval_shape(linearise, *ours.split(y), ours).rows
+    # Besides radiance, one, and residual.
+    assert rows.shape[-1] == len(toy_sky.FREE) + 3
     assert y.size > 2 * len(toy_sky.FREE)
 
 
 def test_unused_pixels_do_not_count():
     ours, y = problem(toy_sky.Toy(), ["mie_g"], exposure=("free", "fixed"))
-    residual, slope = both(y, ours)
+    residual, slope = residuals(y, ours), plain_residuals.jacobian(y, ours)
     unused = ~np.repeat(np.asarray(ours.batch.used).reshape(-1), 3)
     assert unused.any()
     assert np.all(residual[unused] == 0)
     assert np.all(slope[unused] == 0)
+    assert np.isfinite(linearise(*ours.split(y), ours).rows).all()
 
 
 def test_residuals_at_the_truth_are_the_noise():
@@ -87,36 +110,36 @@ def test_residuals_at_the_truth_are_the_noise():
 def test_triangle_holds_what_least_squares_needs():
     random = np.random.default_rng(1)
     slope, residual = random.standard_normal((500, 4)), random.standard_normal(500)
-    factor = np.asarray(triangle(jnp.asarray(residual, jnp.float32), jnp.asarray(slope, jnp.float32)), float)
+    factor = triangle(residual, slope)
     r, z = factor[:-1, :-1], factor[:-1, -1]
-    # Float32 rounding of sums of 500 terms.
-    np.testing.assert_allclose(r.T @ r, slope.T @ slope, atol=1e-3)
-    np.testing.assert_allclose(r.T @ z, slope.T @ residual, atol=1e-3)
-    assert np.sum(factor[:, -1] ** 2) == pytest.approx(np.sum(residual**2), rel=1e-5)
+    np.testing.assert_allclose(r.T @ r, slope.T @ slope, atol=1e-9)
+    np.testing.assert_allclose(r.T @ z, slope.T @ residual, atol=1e-9)
+    assert np.sum(factor[:, -1] ** 2) == pytest.approx(np.sum(residual**2), rel=1e-12)
+    assert triangle(residual[:2], slope[:2]).shape == (5, 5)
 
 
 def test_smooth_fields_are_orthogonal_with_mean_square_one():
     """So that a sum of b of them with coefficients of variance 1/b has variance 1 in the mean over the used pixels."""
     batch = stack(toy_sky.observations(), [680.0, 550.0, 440.0])
-    fields = smooth_fields(batch, 3)
-    used = np.asarray(batch.used)
-    for field, pixels in zip(fields, used, strict=True):
-        assert np.all(field[~pixels] == 0)
-        product = field[pixels].T @ field[pixels] / pixels.sum()
-        np.testing.assert_allclose(product, np.eye(product.shape[0]), atol=1e-8)
+    fields = Fields.of(batch, 3)
+    for image, pixels in enumerate(np.asarray(batch.used)):
+        field = np.asarray(fields.at(batch.directions[image, pixels], fields.centre[image], fields.coefficient[image]))
+        np.testing.assert_allclose(field.T @ field / pixels.sum(), np.eye(field.shape[1]), atol=1e-3)
     # On the sphere a polynomial of degree 3 has (3 + 1)² coefficients.
-    assert fields.shape[-1] == 16
+    assert fields.coefficient.shape[-1] == 16
 
 
-def test_projection_is_the_jacobian_transposed():
+def test_a_push_is_the_jacobian_transposed(x64):
     """Against a relative error put into the radiance by hand."""
-    ours, y = problem(toy_sky.Toy(), toy_sky.FREE)
-    linearisation = linearise(y[: ours.parameters.size], ours)
-    _, slope = jacobian(y, linearisation, ours)
-    fields = jnp.asarray(smooth_fields(ours.batch, 1), y.dtype)
-    expected = light(y, linearisation, ours)
-    got = projected(slope, expected, fields, ours)
+    ours, y = problem(toy_sky.Toy(), toy_sky.FREE, exposure=("free", "fixed"))
+    ours = dataclasses.replace(ours, fields=Fields.of(ours.batch, 1))
+    got = pushes(y, linearise(*ours.split(y), ours), ours)
+    coordinates, moved = ours.parts(ours.split(y)[0])
+    expected = light(y, predict(ours.sky(coordinates), ours.batch.views(moved)), ours)
     image, channel, field = 1, 2, 3
-    wrong = expected.at[image, :, channel].multiply(1 + fields[image, :, field])
-    moved = ((wrong - expected) * ours.weight).reshape(-1)
-    np.testing.assert_allclose(got[image, channel, field], slope.T @ moved, rtol=1e-4, atol=1e-2)
+    forms = ours.fields.at(ours.batch.directions[image], ours.fields.centre[image], ours.fields.coefficient[image])
+    wrong = expected.at[image, :, channel].multiply(1 + forms[:, field])
+    moved = np.asarray((wrong - expected) * ours.weight).reshape(-1)
+    np.testing.assert_allclose(
+        got[image, channel, field], plain_residuals.jacobian(y, ours).T @ moved, rtol=1e-8, atol=1e-6
+    )

@@ -9,7 +9,8 @@ from toy_sky import FREE, Toy
 
 from diffatmo.models.base import Ray
 from fitting import FitError, fit
-from fitting.solve import distance, solve
+from fitting.search import distance
+from fitting.solve import solve
 
 
 @pytest.mark.parametrize(("factor", "g"), [(1.3, 0.6), (0.7, 0.9)])

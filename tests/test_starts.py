@@ -10,7 +10,7 @@ from toy_sky import FREE, Toy, truth
 from fitting import FitError, FitResult, fit, report
 from fitting.batch import stack
 from fitting.parameters import select
-from fitting.residuals import Problem
+from fitting.problem import Problem
 from fitting.starts import grid, ranked, separation, thinned
 
 

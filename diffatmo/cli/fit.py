@@ -281,7 +281,7 @@ def run(job: Job, directory: Path, *, overwrite: bool, quiet: bool = False) -> b
 
     import fitting
     from fitting import checkpoint, report
-    from fitting.solve import INTERRUPTED
+    from fitting.search import INTERRUPTED
 
     console = make_console(quiet=quiet)
     file = directory / checkpoint.FILE

@@ -1,0 +1,118 @@
+"""χ² and its derivatives from the rows of a linearisation: small problems, solved in double precision by numpy.
+
+With Q orthogonal and [J r] = Q [[R, z], [0, ρ]]: JᵀJ = RᵀR, Jᵀr = Rᵀz and |r|² = |z|² + ρ². The right side, called the
+*triangular factor* of the problem, holds everything that least squares needs to know of both.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from diffatmo.compiling import outermost
+from fitting.linearisation import Linearisation
+from fitting.parameters import Coordinates
+from fitting.problem import Linear, Problem
+
+Factor = Float[np.ndarray, "n+1 n+1"]
+
+
+def triangle(residual: Float[np.ndarray, " residual"], slope: Float[np.ndarray, "residual n"]) -> Factor:
+    """The triangular factor of [J r], with as many rows as columns however few residuals there are."""
+    columns = np.concatenate([slope, residual[:, None]], axis=-1)
+    missing = max(columns.shape[1] - len(columns), 0)
+    return np.asarray(np.linalg.qr(np.concatenate([columns, np.zeros((missing, columns.shape[1]))]), mode="r"))
+
+
+def slopes(
+    y: Coordinates, columns: Float[np.ndarray, "image w row k"], problem: Problem
+) -> Float[np.ndarray, "image w row n"]:
+    """Derivatives of the residuals with respect to ``y``, from columns as those of :attr:`Linearisation.rows`."""
+    colour, channel = problem.parameters.colours()
+    nuisances = problem.batch.nuisances
+    exposure = _exposure(y, problem)[..., None]
+    tangents, lit, one = columns[..., :-3], exposure * columns[..., -3:-2], columns[..., -2:-1]
+    touched = (channel == -1) | (np.arange(columns.shape[1])[:, None] == channel)
+    of_atmosphere = np.where(touched[:, None], tangents[..., colour], 0) * exposure
+    # No more than one component of an image's offset is a coordinate's.
+    own = np.asarray(nuisances.offset_index)[..., None] == np.arange(nuisances.offsets)
+    turns = tangents[..., colour.max() + 1 :] @ own.astype(float)[:, None]
+    of_offsets = turns * np.asarray(nuisances.unit, float) * exposure
+    own = (np.asarray(nuisances.factor_index)[..., None] == np.arange(nuisances.factors)).any(axis=-2)
+    of_factors = np.where(own[:, :, None], lit, 0)
+    own = np.asarray(nuisances.pedestal_index)[..., None] == np.arange(nuisances.pedestals)
+    of_pedestals = np.where(own[:, :, None], one, 0)
+    return np.concatenate([of_atmosphere, of_offsets, of_factors, of_pedestals], axis=-1)
+
+
+def _exposure(y: Coordinates, problem: Problem) -> Float[np.ndarray, "image w 1"]:
+    return _of_channels(problem.batch.exposure(problem.split(y)[1]))
+
+
+def _pedestal(linear: Linear, problem: Problem) -> Float[np.ndarray, "image w 1"]:
+    return _of_channels(problem.batch.nuisances.pedestal(linear))
+
+
+def _of_channels(values: Float[Array, "image 1 w"]) -> Float[np.ndarray, "image w 1"]:
+    return np.swapaxes(np.asarray(values, dtype=np.float64), 1, 2)
+
+
+def jacobian(
+    y: Coordinates, linearisation: Linearisation, problem: Problem
+) -> tuple[Float[np.ndarray, " r"], Float[np.ndarray, "r n"]]:
+    """Residuals whose squares, and a Jacobian whose products, are those of all pixels at ``y``.
+
+    The linearisation is that at the ``x`` in ``y``; its own linear nuisances may be others.
+    """
+    rows = np.asarray(linearisation.rows, dtype=np.float64)
+    before = jnp.concatenate([problem.split(y)[0], linearisation.linear])
+    brighter = _exposure(y, problem) - _exposure(before, problem)
+    raised = _pedestal(problem.split(y)[1], problem) - _pedestal(linearisation.linear, problem)
+    residual = rows[..., -1] + brighter * rows[..., -3] + raised * rows[..., -2]
+    return residual.ravel(), slopes(y, rows, problem).reshape(residual.size, -1)
+
+
+def reduce_images(y: Coordinates, linearisation: Linearisation, problem: Problem) -> Factor:
+    """The triangular factor of the images alone, with their loss.
+
+    Where the linear nuisances are not those of the linearisation, a robust loss is no more than its last column says: it is
+    concave in the squares, so the parabola of its weights lies above it.
+    """
+    factor = triangle(*jacobian(y, linearisation, problem))
+    # The squares of the weighted residuals are less than the loss, whose gradient they have.
+    factor[-1, -1] = np.sqrt(factor[-1, -1] ** 2 + max(float(linearisation.beyond), 0))
+    return factor
+
+
+def reduce(y: Coordinates, linearisation: Linearisation, problem: Problem) -> Factor:
+    """The triangular factor of the whole problem at ``y``: the images with their loss, and what is known besides."""
+    factor = reduce_images(y, linearisation, problem)
+    if not problem.known:
+        return factor
+    known, pull = known_rows(y, problem)
+    return triangle(np.concatenate([factor[:, -1], known]), np.concatenate([factor[:, :-1], pull]))
+
+
+def known_rows(y: Coordinates, problem: Problem) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k n"]]:
+    """Residuals of what is known besides the images, and their derivatives: of the priors, and of every offset."""
+    residual, slope = outermost(_known_rows)(y, problem)
+    return np.asarray(residual, dtype=np.float64), np.asarray(slope, dtype=np.float64)
+
+
+def _known_rows(y: Coordinates, problem: Problem) -> tuple[Float[Array, " k"], Float[Array, "k n"]]:
+    size, priors = problem.parameters.size, problem.priors
+
+    def of(y: Coordinates) -> Float[Array, " k"]:
+        # An offset is 0 ± 1 in its unit.
+        offsets = y[size : problem.size]
+        if priors is None:
+            return offsets
+        return jnp.concatenate([priors.residuals(problem.parameters.atmosphere(y[:size])), offsets])
+
+    return of(y), jax.jacfwd(of)(y)
+
+
+def pushes(y: Coordinates, linearisation: Linearisation, problem: Problem) -> Float[np.ndarray, "image w b n"]:
+    """Jᵀ of the residuals that a relative error of the light by each of the smooth fields, in one image and channel, causes."""
+    columns = np.asarray(linearisation.pushes, dtype=np.float64)
+    return slopes(y, columns, problem) * _exposure(y, problem)[..., None]

@@ -1,0 +1,77 @@
+"""What a finer model says of the one that was fitted: a correction of its light, and what may be left of its error."""
+
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import PartitionSpec
+from jaxtyping import Float
+
+from diffatmo.models import Model
+from fitting.elimination import RANK_TOLERANCE
+from fitting.least_squares import pushes
+from fitting.linearisation import AXIS, spread
+from fitting.parameters import Coordinates
+from fitting.problem import Predicted, Problem, predict
+from fitting.search import Point
+
+LARGEST_CORRECTION = 1.25
+"""Factor beyond which a finer model is no correction any more."""
+
+REMAINING = 1 / 5
+"""Error of a finer model over the difference to the coarser one: at most that for ``Moments`` against Monte Carlo in
+atmospheres of aerosol optical depth 0.1 to 0.3 and g up to 0.74, suns from 35° to 93°, once the Monte Carlo's own error is
+taken off (``tests/benchmarks/accuracy.py``). Not so for g = 0.9, where neither resolves the outskirts of the aureole and the
+model's error is understated."""
+
+
+def correction(x: Coordinates, problem: Problem, radiance: Predicted, finer: Model) -> Predicted:
+    """What ``finer`` expects over the ``radiance`` of the problem's own model; 1 where there is nothing to compare."""
+    if problem.batch.mesh is None:
+        return _correction(x, problem, radiance, finer)
+    everywhere, apart = PartitionSpec(), PartitionSpec(None, AXIS)
+    arrays, rest = eqx.partition(problem, eqx.is_array)
+    return jax.shard_map(
+        lambda x, arrays, radiance: _correction(x, eqx.combine(arrays, rest), radiance, finer),
+        mesh=problem.batch.mesh,
+        in_specs=(everywhere, spread(arrays, everywhere, apart), apart),
+        out_specs=apart,
+        check_vma=False,
+    )(x, arrays, radiance)
+
+
+def _correction(x: Coordinates, problem: Problem, radiance: Predicted, finer: Model) -> Predicted:
+    coordinates, moved = problem.parts(x)
+    batch = problem.batch
+    wanted = predict(finer.sky(problem.parameters.atmosphere(coordinates)), batch.views(moved), batch.tiles)
+    known = batch.used[..., None] & (radiance > 0) & (wanted > 0)
+    ratio = wanted / jnp.where(known, radiance, 1)
+    return jnp.where(known, jnp.clip(ratio, 1 / LARGEST_CORRECTION, LARGEST_CORRECTION), 1)
+
+
+def deviation(problem: Problem) -> Float[np.ndarray, "image w"]:
+    """RMS of the correction over the used pixels of every image."""
+    used = np.asarray(problem.batch.used)
+    off = np.where(used[..., None], np.asarray(problem.correction) - 1, 0)
+    return np.sqrt((off**2).sum(axis=1) / np.maximum(used.sum(axis=1), 1)[:, None])
+
+
+def covariance(best: Point, problem: Problem) -> Float[np.ndarray, "n n"]:
+    """Covariance of the coordinates from what the correction leaves of the model's error.
+
+    The finer model is taken to be off by :data:`REMAINING` of what the coarser one was off: in every image by a smooth random
+    function of direction, half of its variance common to all channels and half of each channel's own. Its amplitude is the
+    RMS of the correction there.
+    """
+    pushed = pushes(best.y, best.linearisation, problem)
+    amplitude = REMAINING * deviation(problem)
+    pushed = pushed * amplitude[:, :, None, None] / math.sqrt(2 * pushed.shape[2])
+    every = np.concatenate([pushed.reshape(-1, best.y.size), pushed.sum(axis=1).reshape(-1, best.y.size)])
+    # δy = (RᵀR)⁻¹ Jᵀ δr: through the pseudo-inverse, as some combinations may not be determined at all.
+    length = np.linalg.norm(best.triangle[:, :-1], axis=0)
+    scale = np.where(length > 0, length, 1)
+    inverse = np.linalg.pinv(best.triangle[:, :-1] / scale, rcond=RANK_TOLERANCE) / scale[:, None]
+    shifts = every @ inverse @ inverse.T
+    return shifts.T @ shifts

@@ -1,0 +1,136 @@
+"""A fit as a problem of least squares: what the whitened residuals depend on.
+
+``y`` holds the coordinates of the atmosphere's free parameters, then the nuisances (:mod:`fitting.nuisances`): the offsets of
+the views, and last the linear ones. What the model depends on, all but the linear ones, is called ``x``. Everything else,
+images and geometry included, is in :class:`Problem`, whose arrays are arguments of the compiled functions, never constants
+inside them.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from diffatmo.models import Model, Moments, Sky
+from diffatmo.models.base import View
+from fitting.batch import Batch, Views
+from fitting.observation import sigma
+from fitting.parameters import Coordinates, Parameters
+from fitting.priors import Priors
+from fitting.robust import Loss
+from fitting.smooth import Fields
+
+Predicted = Float[Array, "image pixel w"]
+Linear = Float[Array, " l"]
+
+
+class Problem(eqx.Module):
+    """All that the residuals depend on besides ``y``.
+
+    ``weight`` is 1/sigma, and 0 for pixels that are not used; ``shell`` is what the model knows of the planet alone, if
+    it makes use of that and the planet is not free. ``correction`` is what a finer model says, over what this one says, at
+    one point near the optimum; it scales the radiance and its derivatives. ``loss`` is what outliers are given, if they are
+    not given their squares, and ``fields`` are the forms that errors of the model may have.
+    """
+
+    model: Model
+    parameters: Parameters
+    batch: Batch
+    weight: Predicted
+    shell: Any = None
+    correction: Predicted | None = None
+    priors: Priors | None = None
+    loss: Loss | None = None
+    fields: Fields | None = None
+
+    def sky(self, coordinates: Coordinates) -> Sky:
+        """The sky at coordinates of the atmosphere."""
+        atmosphere = self.parameters.atmosphere(coordinates)
+        if isinstance(self.model, Moments) and self.shell is not None:
+            return self.model.sky(atmosphere, self.shell)
+        return self.model.sky(atmosphere)
+
+    @property
+    def size(self) -> int:
+        """Number of coordinates in ``x``."""
+        return self.parameters.size + self.batch.nuisances.offsets
+
+    def split(self, y: Coordinates) -> tuple[Coordinates, Linear]:
+        """``x``, and the linear nuisances."""
+        return y[: self.size], y[self.size :]
+
+    def parts(self, x: Coordinates) -> tuple[Coordinates, Float[Array, "image moving"]]:
+        """The coordinates of the atmosphere, and what moves the view of each image."""
+        return x[: self.parameters.size], self.batch.nuisances.moved(x[self.parameters.size :])
+
+    @property
+    def start(self) -> Coordinates:
+        """``x`` at the start: no offset."""
+        start = self.parameters.start
+        return jnp.concatenate([start, jnp.zeros(self.batch.nuisances.offsets, start.dtype)])
+
+    @property
+    def limits(self) -> tuple[Coordinates, Coordinates]:
+        """The smallest and the largest ``x``."""
+        lower, upper = self.parameters.limits
+        endless = jnp.full(self.batch.nuisances.offsets, jnp.inf, lower.dtype)
+        return jnp.concatenate([lower, -endless]), jnp.concatenate([upper, endless])
+
+    @property
+    def known(self) -> bool:
+        """Whether anything is known besides the images."""
+        return self.priors is not None or self.batch.nuisances.offsets > 0
+
+
+def planet_shell(model: Model, parameters: Parameters) -> Any:
+    """The geometry that ``model`` would else compute in each step; None if there is none or the planet is free."""
+    if not isinstance(model, Moments) or {"bottom_radius", "top_radius"} & set(parameters.fields):
+        return None
+    init = parameters.init
+    return model.shell(bottom_radius=init.bottom_radius, top_altitude=init.top_altitude)
+
+
+def seen(view: View, directions: Float[Array, "pixel part 3"]) -> Float[Array, "pixel w"]:
+    """The radiance of pixels, the mean over their parts."""
+    return jnp.mean(view.radiance(view=directions).radiance, axis=1)
+
+
+def predict(sky: Sky, views: Views, tiles: int = 1) -> Predicted:
+    """Radiance of ``sky`` in the pixels of every image.
+
+    The images, and ``tiles`` of each, are visited in loops of the compiled program: many compile as fast as one and need the
+    memory of one.
+    """
+
+    def one(image: tuple[Array, Array, Array]) -> Float[Array, "pixel w"]:
+        altitude, sun, directions = image
+        view = sky.view(altitude=altitude, sun=sun)
+        tiled = directions.reshape(tiles, -1, *directions.shape[1:])
+        found = jax.lax.map(lambda tile: seen(view, tile), tiled)
+        return found.reshape(-1, found.shape[-1])
+
+    return jax.lax.map(one, tuple(views))
+
+
+def light(y: Coordinates, radiance: Predicted, problem: Problem) -> Predicted:
+    """Exposure times radiance: what is expected of every pixel but for the pedestal."""
+    return radiance * problem.batch.exposure(problem.split(y)[1])
+
+
+def expected(y: Coordinates, radiance: Predicted, problem: Problem) -> Predicted:
+    """The light and the pedestal of every pixel."""
+    return light(y, radiance, problem) + problem.batch.nuisances.pedestal(problem.split(y)[1])
+
+
+def whitened(y: Coordinates, radiance: Predicted, problem: Problem) -> Predicted:
+    """(expected - measured) / sigma of every pixel and channel; 0 for those not used."""
+    # An unused pixel may hold anything, and 0 * NaN is NaN.
+    difference = expected(y, radiance, problem) - problem.batch.measured
+    return jnp.where(problem.batch.used[..., None], difference, 0) * problem.weight
+
+
+def weights(batch: Batch, light: Predicted) -> Predicted:
+    """1/sigma of pixels whose signal is ``light``, 0 of those not used."""
+    return jnp.where(batch.used[..., None], 1 / sigma(batch, light), 0)
