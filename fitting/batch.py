@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float
 
 from diffatmo.camera import Camera
 from fitting._errors import FitError
-from fitting.nuisances import FOCAL, OFFSETS, POSE, SUN, Nuisances, displace, gather, rotate, sun_axes
+from fitting.nuisances import AEROSOL, FOCAL, OFFSETS, POSE, SUN, Nuisances, displace, gather, rotate, sun_axes
 from fitting.observation import FIXED, Observation
 
 PIXEL_FIELDS = ("directions", "measured", "used", "noise", "noise_shot", "noise_floor")
@@ -24,11 +24,13 @@ TILE = 8192
 
 
 class Views(NamedTuple):
-    """Where the images are taken from, under which sun, and where their pixels look."""
+    """Where the images are taken from, under which sun, where their pixels look, and through how much more aerosol."""
 
     altitude: Float[Array, " image"]
     sun: Float[Array, "image 3"]
     directions: Float[Array, "image pixel part 3"]
+    aerosol: Float[Array, " image"] | None
+    """Logarithm of the factor; None if it is 1 for all."""
 
 
 class Batch(eqx.Module):
@@ -61,7 +63,7 @@ class Batch(eqx.Module):
         """The views of the images with their free offsets ``moved``."""
         moving = self.nuisances.moving
         if not moving:
-            return Views(self.altitude, self.sun, self.directions)
+            return Views(self.altitude, self.sun, self.directions, None)
         by = jnp.zeros((len(self.sun), len(OFFSETS)), moved.dtype).at[:, np.array(moving)].set(moved)
         directions = self.directions
         if FOCAL in moving:
@@ -73,7 +75,10 @@ class Batch(eqx.Module):
             ]
             directions = jnp.stack(zoomed)
         return Views(
-            self.altitude, displace(self.sun, self.sun_axes, by[:, SUN]), rotate(directions, by[:, None, None, POSE])
+            self.altitude,
+            displace(self.sun, self.sun_axes, by[:, SUN]),
+            rotate(directions, by[:, None, None, POSE]),
+            by[:, AEROSOL] if AEROSOL in moving else None,
         )
 
 

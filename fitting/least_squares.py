@@ -94,7 +94,7 @@ def reduce(y: Coordinates, linearisation: Linearisation, problem: Problem) -> Fa
 
 
 def known_rows(y: Coordinates, problem: Problem) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k n"]]:
-    """Residuals of what is known besides the images, and their derivatives: of the priors, and of every offset."""
+    """Residuals of what is known besides the images, and their derivatives: of the priors, and of the offsets."""
     residual, slope = outermost(_known_rows)(y, problem)
     return np.asarray(residual, dtype=np.float64), np.asarray(slope, dtype=np.float64)
 
@@ -103,8 +103,8 @@ def _known_rows(y: Coordinates, problem: Problem) -> tuple[Float[Array, " k"], F
     size, priors = problem.parameters.size, problem.priors
 
     def of(y: Coordinates) -> Float[Array, " k"]:
-        # An offset is 0 ± 1 in its unit.
-        offsets = y[size : problem.size]
+        # An offset is 0 ± 1 in its unit, or its innovation is.
+        offsets = problem.batch.nuisances.innovation @ y[size : problem.size]
         if priors is None:
             return offsets
         return jnp.concatenate([priors.residuals(problem.parameters.atmosphere(y[:size])), offsets])

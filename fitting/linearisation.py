@@ -28,9 +28,12 @@ import numpy as np
 from jax.sharding import PartitionSpec
 from jaxtyping import Array, Float, Int
 
-from fitting.batch import PIXEL_FIELDS
+from diffatmo.atmosphere import Atmosphere
+from diffatmo.models import Sky
+from fitting.batch import PIXEL_FIELDS, Views
+from fitting.nuisances import AEROSOL
 from fitting.parameters import Coordinates
-from fitting.problem import Linear, Predicted, Problem, seen
+from fitting.problem import Linear, Predicted, Problem, hazier, seen
 
 T = TypeVar("T")
 AXIS = "pixel"
@@ -162,10 +165,13 @@ def visit(
     coordinates, moved = problem.parts(x)
     colour, _ = problem.parameters.colours()
     seeds = jnp.asarray(colour == np.arange(colour.max() + 1)[:, None], dtype=coordinates.dtype)
-    sky, of_sky = _push(problem.sky, (coordinates,), (seeds,))
-    moving = jnp.eye(len(batch.nuisances.moving), dtype=moved.dtype)
-    each = jnp.broadcast_to(moving[:, None], (len(moving), *moved.shape))
-    views, of_views = _push(batch.views, (moved,), (each,)) if len(moving) else (batch.views(moved), None)
+    air, of_air = _push(problem.parameters.atmosphere, (coordinates,), (seeds,))
+    # The tangents of a free aerosol come last, as it does among the offsets.
+    apart = AEROSOL in batch.nuisances.moving
+    turning = len(batch.nuisances.moving) - apart
+    each = jnp.broadcast_to(jnp.eye(turning, moved.shape[1], dtype=moved.dtype)[:, None], (turning, *moved.shape))
+    views, of_views = _push(batch.views, (moved,), (each,)) if turning else (batch.views(moved), None)
+    sky, of_sky = (None, None) if apart else _push(problem.sky, (air,), (of_air,))
     tiled = lambda values: values.reshape(len(values), batch.tiles, -1, *values.shape[2:])
     pixels = {name: tiled(getattr(batch, name)) for name in PIXEL_FIELDS if name != "directions"}
     pixels |= {"weight": tiled(problem.weight), "directions": tiled(views.directions)}
@@ -176,19 +182,23 @@ def visit(
         pixels["turned"] = jnp.moveaxis(jax.vmap(tiled)(of_views.directions), 0, 2)
         more = more | {"displaced": jnp.swapaxes(of_views.sun, 0, 1)}
 
-    def of_image(image: tuple[Array, Array, dict[str, Array], dict[str, Array]]) -> tuple[Any, Any]:
-        altitude, sun, own, pixels = image
-        view, of_view = _push(lambda sky: sky.view(altitude=altitude, sun=sun), (sky,), (of_sky,))
+    def of_image(image: tuple[Views, dict[str, Array], dict[str, Array]]) -> tuple[Any, Any]:
+        here, own, pixels = image
+        its_sky, of_its_sky = sky, of_sky
+        if here.aerosol is not None:
+            its_sky, of_its_sky = _hazier_sky(problem, air, of_air, here.aerosol)
+        look = lambda sky, sun: sky.view(altitude=here.altitude, sun=sun)
+        view, of_view = _push(lambda sky: look(sky, here.sun), (its_sky,), (of_its_sky,))
         displaced = None
         if "displaced" in own:
-            _, displaced = _push(lambda sun: sky.view(altitude=altitude, sun=sun), (sun,), (own["displaced"],))
+            _, displaced = _push(lambda sun: look(its_sky, sun), (here.sun,), (own["displaced"],))
 
         def of_tile(carry: Any, tile: Tile) -> tuple[Any, Any]:
             directions = tile["directions"]
             light, tangents = _push(lambda view: seen(view, directions), (view,), (of_view,))
             if displaced is not None:
                 _, turns = _push(seen, (view, directions), (displaced, tile["turned"]))
-                tangents = jnp.concatenate([tangents, turns])
+                tangents = jnp.concatenate([tangents[: len(seeds)], turns, tangents[len(seeds) :]])
             tangents = jnp.moveaxis(tangents, 0, -1)
             if "correction" in tile:
                 light, tangents = light * tile["correction"], tangents * tile["correction"][..., None]
@@ -196,8 +206,19 @@ def visit(
 
         return jax.lax.scan(of_tile, empty, pixels)
 
-    carry, found = jax.lax.map(of_image, (views.altitude, views.sun, more, pixels))
+    # Directions are among the pixels.
+    places = views._replace(directions=jnp.zeros_like(views.directions[:, :0]))
+    carry, found = jax.lax.map(of_image, (places, more, pixels))
     return carry, jax.tree.map(lambda values: values.reshape(len(values), -1, *values.shape[3:]), found)
+
+
+def _hazier_sky(problem: Problem, air: Atmosphere, of_air: Any, log: Array) -> tuple[Sky, Any]:
+    """The sky of an image with more aerosol, and its derivatives along those of the air, and last along the aerosol's."""
+    none = jax.tree.map(lambda leaf: jnp.zeros_like(leaf[:1]), of_air)
+    along_air = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), of_air, none)
+    count = len(jax.tree.leaves(along_air)[0])
+    along_aerosol = jnp.zeros(count, log.dtype).at[-1].set(1)
+    return _push(lambda air, log: problem.sky(hazier(air, log)), (air, log), (along_air, along_aerosol))
 
 
 def _push(function: Callable[..., T], at: tuple[Any, ...], along: tuple[Any, ...]) -> tuple[T, Any]:

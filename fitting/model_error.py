@@ -45,7 +45,7 @@ def correction(x: Coordinates, problem: Problem, radiance: Predicted, finer: Mod
 def _correction(x: Coordinates, problem: Problem, radiance: Predicted, finer: Model) -> Predicted:
     coordinates, moved = problem.parts(x)
     batch = problem.batch
-    wanted = predict(finer.sky(problem.parameters.atmosphere(coordinates)), batch.views(moved), batch.tiles)
+    wanted = predict(finer.sky, problem.parameters.atmosphere(coordinates), batch.views(moved), batch.tiles)
     known = batch.used[..., None] & (radiance > 0) & (wanted > 0)
     ratio = wanted / jnp.where(known, radiance, 1)
     return jnp.where(known, jnp.clip(ratio, 1 / LARGEST_CORRECTION, LARGEST_CORRECTION), 1)

@@ -9,19 +9,28 @@ kind                numbers                                                enter
 ``sun_offset``      two angles in the tangent plane of the sun             the sun                                     0 ± 0.5°
 ``pose``            three components of a rotation vector                  the directions of the pixels                0 ± 2°
 ``focal``           the logarithm of a factor                              the directions, by the camera's projection  0 ± 5 %
+``aerosol``         the logarithm of a factor                              the aerosol of this image                   0 ± 30 %
 ==================  =====================================================  ==========================================  ======
 
 Each is fixed, free for an image of its own, or shared by a named group of images.
 
 The first three are *linear*: given the radiance, their optimum follows (:mod:`fitting.elimination`). The others are *offsets*:
-they move the view of a sky that is solved once. An offset touches one image, or those of its group, and images do not mix; so
-the six components of :data:`OFFSETS` need six tangents at most, whatever the number of images.
+they move the view of a sky that is solved once, but for the aerosol, with which every image has a sky of its own. An offset
+touches one image, or those of its group, and images do not mix; so the seven components of :data:`OFFSETS` need seven tangents
+at most, whatever the number of images.
+
+*Time series.* The logarithms a of the aerosols of images at the times t are a stationary Ornstein-Uhlenbeck process, the
+continuous autoregression of first order: ⟨a a'⟩ = σ² exp(-|t - t'| / T). It is Markovian, so what is known beforehand are
+independent innovations (Gillespie 1996, Phys. Rev. E 54, 2084, eqs. 3.1, 3.5),
+
+    a_1 / σ  and  (a_i - ρ a_{i-1}) / (σ √(1 - ρ²)),  ρ = exp(-(t_i - t_{i-1}) / T),  each 0 ± 1.
 
 Rotation vector and tangent plane are smooth where angles are not: at no rotation, and with the sun at the zenith.
 """
 
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import equinox as eqx
@@ -41,13 +50,14 @@ OFFSETS = (
     ("pose", "north_deg"),
     ("pose", "up_deg"),
     ("focal", ""),
+    ("aerosol", ""),
 )
-"""Kind and component of all that moves the view of an image."""
+"""Kind and component of all offsets of an image."""
 
-SUN, POSE, FOCAL = slice(0, 2), slice(2, 5), 5
+SUN, POSE, FOCAL, AEROSOL = slice(0, 2), slice(2, 5), 5, 6
 """Their places among the offsets of an image."""
 
-KINDS = ("exposure", "white_balance", "pedestal", "sun_offset", "pose", "focal")
+KINDS = ("exposure", "white_balance", "pedestal", "sun_offset", "pose", "focal", "aerosol")
 
 
 class Label(NamedTuple):
@@ -68,6 +78,8 @@ class Nuisances(eqx.Module):
     offset_index: Int[Array, "image moving"]
     unit: Float[Array, " m"]
     """rad, or of a logarithm."""
+    innovation: Float[Array, "m m"]
+    """From the offsets, in their units, to what is known beforehand to be independent and 0 ± 1."""
     angle: Bool[Array, " m"]
     factor_index: Int[Array, "image w 2"]
     """Numbers of the factors of exposure and of white balance."""
@@ -136,7 +148,7 @@ def gather(observations: Sequence[Observation], wavelengths: Sequence[float]) ->
     """The nuisances of these images, and what they are called; raises :class:`FitError` for groups that cannot be."""
     for kind in KINDS:
         _check_groups(observations, kind)
-    offsets, units = _Numbers(), list[float]()
+    offsets, units, times = _Numbers(), list[float](), dict[int, tuple[float, float]]()
     of_offsets = np.full((len(observations), len(OFFSETS)), -1)
     for image, observation in enumerate(observations):
         for column, (kind, component) in enumerate(OFFSETS):
@@ -149,6 +161,8 @@ def gather(observations: Sequence[Observation], wavelengths: Sequence[float]) ->
                 raise FitError(
                     f"{observation.name}: {kind}_error: got {error:g}, another image of {group!r} has another"
                 )
+            if kind == "aerosol" and observation.time_h is not None:
+                times.setdefault(of_offsets[image, column], (observation.time_h, observation.aerosol_memory_h))
     factors, pedestals = _Numbers(), _Numbers()
     of_factors = np.stack(
         [
@@ -161,18 +175,32 @@ def gather(observations: Sequence[Observation], wavelengths: Sequence[float]) ->
         [[pedestals.number(name) for name in channel_names(o, "pedestal", wavelengths)] for o in observations]
     )
     moving = np.flatnonzero((of_offsets >= 0).any(axis=0))
-    angle = [name.endswith("_deg") and not name.startswith("focal_") for name in offsets]
+    angle = [name.endswith("_deg") and not name.startswith(("focal_", "aerosol_")) for name in offsets]
     labels = [Label(name, "deg" if is_angle else "") for name, is_angle in zip(offsets, angle, strict=True)]
     return [*labels, *map(Label, [*factors, *pedestals])], Nuisances(
         moving=tuple(int(component) for component in moving),
         offset_index=jnp.asarray(of_offsets[:, moving]),
         unit=jnp.asarray(units, jnp.result_type(float)),
+        innovation=jnp.asarray(_innovation(len(offsets), times), jnp.result_type(float)),
         angle=jnp.asarray(angle, bool),
         factor_index=jnp.asarray(of_factors),
         pedestal_index=jnp.asarray(of_pedestals),
         factors=len(factors),
         pedestals=len(pedestals),
     )
+
+
+def _innovation(size: int, times: dict[int, tuple[float, float]]) -> Float[np.ndarray, "m m"]:
+    """What makes the aerosols taken at ``times`` (h, and their memory), among ``size`` offsets, independent."""
+    matrix = np.eye(size)
+    in_order = sorted(times, key=lambda number: times[number][0])
+    for before, after in pairwise(in_order):
+        (earlier, _), (later, memory) = times[before], times[after]
+        # Images of the same moment may still differ by what single precision can tell apart.
+        correlation = math.exp(-max(later - earlier, 1e-4 * memory) / memory)
+        scale = math.sqrt(1 - correlation**2)
+        matrix[after, after], matrix[after, before] = 1 / scale, -correlation / scale
+    return matrix
 
 
 class _Numbers(dict[str, int]):
@@ -198,7 +226,7 @@ def assumed(observations: Sequence[Observation]) -> list[tuple[str, float, float
     """
     found: dict[tuple[str, float, float, bool, str], None] = {}
     for observation in observations:
-        for kind, unit in (("sun_offset", "_deg"), ("pose", "_deg"), ("focal", "")):
+        for kind, unit in (("sun_offset", "_deg"), ("pose", "_deg"), ("focal", ""), ("aerosol", "")):
             if group_of(observation, kind) is not None:
                 error = getattr(observation, f"{kind}_error")
                 in_degrees = bool(unit)

@@ -35,6 +35,8 @@ SUN_EXCLUSION = math.radians(2.0)
 SUN_OFFSET_ERROR = math.radians(0.5)
 POSE_ERROR = math.radians(2.0)
 FOCAL_ERROR = 0.05
+AEROSOL_ERROR = 0.3
+AEROSOL_MEMORY_H = 6.0
 
 
 class Observation(eqx.Module):
@@ -47,9 +49,13 @@ class Observation(eqx.Module):
     sun_offset: str = eqx.field(static=True)
     pose: str = eqx.field(static=True)
     focal: str = eqx.field(static=True)
+    aerosol: str = eqx.field(static=True)
     sun_offset_error: float
     pose_error: float
     focal_error: float
+    aerosol_error: float
+    aerosol_memory_h: float
+    time_h: float | None
     exposure_value: float
     altitude: float
     sun: Float[np.ndarray, "3"]
@@ -87,9 +93,13 @@ def observe(
     sun_offset: str = FIXED,
     pose: str = FIXED,
     focal: str = FIXED,
+    aerosol: str = FIXED,
     sun_offset_error: float = SUN_OFFSET_ERROR,
     pose_error: float = POSE_ERROR,
     focal_error: float = FOCAL_ERROR,
+    aerosol_error: float = AEROSOL_ERROR,
+    aerosol_memory_h: float = AEROSOL_MEMORY_H,
+    time_h: float | None = None,
     exposure_value: float = 1.0,
     max_pixels: int = MAX_PIXELS,
     name: str = "image",
@@ -124,9 +134,16 @@ def observe(
             what hides them, must be left out: the edge has no derivative.
         focal: Whether the focal length may differ from the camera's, by a factor: ``"fixed"``, ``"free"``, or the name of a
             group. Not for equirectangular pictures, which have none.
+        aerosol: Whether there may be more or less aerosol than the atmosphere's, by a factor: ``"fixed"``, ``"free"``, or the
+            name of a group. Each such image costs the solution of a sky of its own.
         sun_offset_error: Standard deviation of each of the sun's two angles before the image is looked at, rad.
         pose_error: The same of each component of the rotation, rad.
         focal_error: The same of the logarithm of the focal length.
+        aerosol_error: The same of the logarithm of the factor of the aerosol.
+        aerosol_memory_h: Hours in which the aerosol changes: factors of images taken Δt apart are correlated by
+            exp(-Δt / ``aerosol_memory_h``).
+        time_h: When the image was taken, in hours from any time that all images share; None if the aerosol of an image says
+            nothing about that of the next.
         exposure_value: The exposure as far as it is known: pixels = exposure_value × free factor × radiance.
         max_pixels: Average blocks of pixels until no more than this many are used. The model is averaged over four
             directions in each block.
@@ -162,14 +179,25 @@ def observe(
     for key, value in (("exposure", exposure), ("pedestal", pedestal)):
         named = value.removesuffix(PER_CHANNEL) and value != FIXED + PER_CHANNEL
         refuse.unless(bool(named), key, repr(value), '"fixed", "free" or a name')
-    for key, value in (("white_balance", white_balance), ("sun_offset", sun_offset), ("pose", pose), ("focal", focal)):
+    for key, value in (
+        ("white_balance", white_balance),
+        ("sun_offset", sun_offset),
+        ("pose", pose),
+        ("focal", focal),
+        ("aerosol", aerosol),
+    ):
         refuse.unless(bool(value), key, repr(value), '"fixed", "free" or a name')
     for key, error in (
         ("sun_offset_error", sun_offset_error),
         ("pose_error", pose_error),
         ("focal_error", focal_error),
+        ("aerosol_error", aerosol_error),
     ):
-        refuse.unless(0 < error <= 1, key, error, "more than 0 and at most 1" + " rad" * (key != "focal_error"))
+        radians = " rad" if key in ("sun_offset_error", "pose_error") else ""
+        refuse.unless(0 < error <= 1, key, error, f"more than 0 and at most 1{radians}")
+    memory = aerosol_memory_h
+    refuse.unless(memory > 0 and math.isfinite(memory), "aerosol_memory_h", memory, "a finite number of hours > 0")
+    refuse.unless(time_h is None or math.isfinite(time_h), "time_h", time_h, "a finite number of hours")
     if focal != FIXED:
         try:
             camera.zoomed(1.0)
@@ -230,9 +258,13 @@ def observe(
         sun_offset=sun_offset,
         pose=pose,
         focal=focal,
+        aerosol=aerosol,
         sun_offset_error=float(sun_offset_error),
         pose_error=float(pose_error),
         focal_error=float(focal_error),
+        aerosol_error=float(aerosol_error),
+        aerosol_memory_h=float(aerosol_memory_h),
+        time_h=None if time_h is None else float(time_h),
         exposure_value=float(exposure_value),
         altitude=float(altitude),
         sun=toward_sun / np.linalg.norm(toward_sun),

@@ -6,6 +6,7 @@ images and geometry included, is in :class:`Problem`, whose arrays are arguments
 inside them.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -13,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from diffatmo.atmosphere import Atmosphere
 from diffatmo.models import Model, Moments, Sky
 from diffatmo.models.base import View
 from fitting.batch import Batch, Views
@@ -45,9 +47,8 @@ class Problem(eqx.Module):
     loss: Loss | None = None
     fields: Fields | None = None
 
-    def sky(self, coordinates: Coordinates) -> Sky:
-        """The sky at coordinates of the atmosphere."""
-        atmosphere = self.parameters.atmosphere(coordinates)
+    def sky(self, atmosphere: Atmosphere) -> Sky:
+        """The sky of ``atmosphere``, by the model."""
         if isinstance(self.model, Moments) and self.shell is not None:
             return self.model.sky(atmosphere, self.shell)
         return self.model.sky(atmosphere)
@@ -97,21 +98,36 @@ def seen(view: View, directions: Float[Array, "pixel part 3"]) -> Float[Array, "
     return jnp.mean(view.radiance(view=directions).radiance, axis=1)
 
 
-def predict(sky: Sky, views: Views, tiles: int = 1) -> Predicted:
-    """Radiance of ``sky`` in the pixels of every image.
+def hazier(atmosphere: Atmosphere, log_factor: Float[Array, ""] | None) -> Atmosphere:
+    """``atmosphere`` with so much more aerosol of the same kind; None for as much."""
+    if log_factor is None:
+        return atmosphere
+    more = jnp.exp(log_factor)
+    return eqx.tree_at(
+        lambda a: (a.mie_scattering, a.mie_absorption),
+        atmosphere,
+        (more * atmosphere.mie_scattering, more * atmosphere.mie_absorption),
+    )
+
+
+def predict(make: Callable[[Atmosphere], Sky], atmosphere: Atmosphere, views: Views, tiles: int = 1) -> Predicted:
+    """Radiance in the pixels of every image of the skies that ``make`` makes: one for all, unless their aerosols differ.
 
     The images, and ``tiles`` of each, are visited in loops of the compiled program: many compile as fast as one and need the
     memory of one.
     """
 
-    def one(image: tuple[Array, Array, Array]) -> Float[Array, "pixel w"]:
-        altitude, sun, directions = image
+    shared = make(atmosphere) if views.aerosol is None else None
+
+    def one(image: Views) -> Float[Array, "pixel w"]:
+        altitude, sun, directions, aerosol = image
+        sky = make(hazier(atmosphere, aerosol)) if shared is None else shared
         view = sky.view(altitude=altitude, sun=sun)
         tiled = directions.reshape(tiles, -1, *directions.shape[1:])
         found = jax.lax.map(lambda tile: seen(view, tile), tiled)
         return found.reshape(-1, found.shape[-1])
 
-    return jax.lax.map(one, tuple(views))
+    return jax.lax.map(one, views)
 
 
 def light(y: Coordinates, radiance: Predicted, problem: Problem) -> Predicted:

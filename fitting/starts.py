@@ -120,7 +120,7 @@ def radiances(points: Float[Array, "s n"], problem: Problem) -> Float[Array, "s 
     views = problem.batch.views(nuisances.moved(jnp.zeros(nuisances.offsets, points.dtype)))
 
     def one(coordinates: Coordinates) -> Predicted:
-        return predict(problem.sky(coordinates), views)
+        return predict(problem.sky, problem.parameters.atmosphere(coordinates), views)
 
     return jax.lax.map(one, points)
 

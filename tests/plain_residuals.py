@@ -10,7 +10,8 @@ from fitting.problem import predict, whitened
 def residuals(y, problem):
     """(expected - measured) / sigma of every pixel and channel, from the model itself."""
     coordinates, moved = problem.parts(problem.split(y)[0])
-    return whitened(y, predict(problem.sky(coordinates), problem.batch.views(moved)), problem).reshape(-1)
+    atmosphere = problem.parameters.atmosphere(coordinates)
+    return whitened(y, predict(problem.sky, atmosphere, problem.batch.views(moved)), problem).reshape(-1)
 
 
 def jacobian(y, problem):

@@ -135,7 +135,8 @@ def test_a_push_is_the_jacobian_transposed(x64):
     ours = dataclasses.replace(ours, fields=Fields.of(ours.batch, 1))
     got = pushes(y, linearise(*ours.split(y), ours), ours)
     coordinates, moved = ours.parts(ours.split(y)[0])
-    expected = light(y, predict(ours.sky(coordinates), ours.batch.views(moved)), ours)
+    atmosphere = ours.parameters.atmosphere(coordinates)
+    expected = light(y, predict(ours.sky, atmosphere, ours.batch.views(moved)), ours)
     image, channel, field = 1, 2, 3
     forms = ours.fields.at(ours.batch.directions[image], ours.fields.centre[image], ours.fields.coefficient[image])
     wrong = expected.at[image, :, channel].multiply(1 + forms[:, field])

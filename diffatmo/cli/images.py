@@ -30,6 +30,10 @@ NUMBERS_AND_NAMES = (
     "pose",
     "focal",
     "focal_error",
+    "aerosol",
+    "aerosol_error",
+    "aerosol_memory_h",
+    "time_h",
     "saturation",
 )
 ANGLES = (

@@ -45,6 +45,12 @@ IMAGE_KEYS: dict[str, Key] = {
     "pose_error_deg": Number("Standard deviation of each of its angles.  [default: 2]", 0, 30, positive=True),
     "focal": Word("The focal length may be off by a factor: fixed, free, or the name of a group.  [default: fixed]"),
     "focal_error": Number("Standard deviation of its logarithm.  [default: 0.05]", 0, 1, positive=True),
+    "aerosol": Word(
+        "There may be more or less aerosol than the atmosphere's: fixed, free, or the name of a group.  [default: fixed]"
+    ),
+    "aerosol_error": Number("Standard deviation of the logarithm of that factor.  [default: 0.3]", 0, 1, positive=True),
+    "aerosol_memory_h": Number("Hours in which the aerosol changes.  [default: 6]", 0, positive=True),
+    "time_h": Number("Hours from any moment that all images share; for the aerosol's change."),
     "noise": Number("Relative standard deviation per pixel and channel.  [default: 0.01]", 0, 10),
     "noise_shot": Number("Variance per unit of signal (photon noise).  [default: 0]", 0, 1e30),
     "noise_floor": Number("Standard deviation of a dark pixel (read noise).  [default: 1e-4 of the median]", 0, 1e30),
