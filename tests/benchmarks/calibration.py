@@ -80,14 +80,16 @@ def shipped_bars(name: str) -> list[float]:
     scene = Path(generate.__file__).parent / name / "scene.toml"
     with tempfile.TemporaryDirectory() as directory:
         out = Path(directory) / "fit"
-        subprocess.run([sys.executable, "-m", "diffatmo", "fit", scene, "-o", out], check=True, capture_output=True)
+        subprocess.run(
+            [sys.executable, "-m", "diffatmo", "fit", "--config", scene, "-o", out], check=True, capture_output=True
+        )
         found = json.loads((out / "fit.json").read_text())
     return [estimate["standard_error"] for estimate in found["parameters"]]
 
 
 def main(count: int, names: list[str]) -> None:
     for name in names:
-        truth = generate.ATMOSPHERES[name]
+        truth, bars = generate.ATMOSPHERES[name], shipped_bars(name)
         ways = [(number, k) for k in range(count) for number in range(len(generate.SUN_ZENITH_DEG))]
         found = {way: traced(name, *way) for way in track(ways, f"{name}: paths")}
         traces = [np.stack([found[number, k] for k in range(count)]) for number in range(len(generate.SUN_ZENITH_DEG))]
@@ -99,7 +101,7 @@ def main(count: int, names: list[str]) -> None:
             "mean error / shipped error bar",
             title=f"{name}: {count} realisations, χ² {np.mean([r.reduced_chi2 for r in results]):.3f}",
         )
-        for number, (estimate, bar) in enumerate(zip(results[0].parameters, shipped_bars(name), strict=True)):
+        for number, (estimate, bar) in enumerate(zip(results[0].parameters, bars, strict=True)):
             pulls = np.array([result.parameters[number].pull for result in results])
             errors = np.array([result.parameters[number].value - estimate.truth for result in results]) / bar
             uncertain = errors.std(ddof=1) / np.sqrt(count)
