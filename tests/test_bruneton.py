@@ -16,6 +16,10 @@ from diffatmo.models.tables import PARAMETERISATIONS, bilinear
 from diffatmo.models.transmittance_table import to_top
 
 SMALL = Bruneton(sizes=Sizes(32, 128, 8, 32, 16, 64, 24, 8), steps=Steps(64, 20, 20, 8, 16), orders=2)
+TINY = replace(SMALL, sizes=Sizes(8, 16, 4, 8, 4, 8, 6, 4))
+"""For what is exact at its entries: it takes no time but that of the compiler."""
+RAYS = 600
+"""Fewer are made as many, as each number would be a program of its own."""
 
 
 @eqx.filter_jit
@@ -23,9 +27,21 @@ def solved(model, atmosphere):
     return model.sky(atmosphere)
 
 
+solved_once = eqx.filter_jit(lambda model, air: model.sky(air), compiler_options={"xla_backend_optimization_level": 0})
+"""For tables so small that what takes long is compilation."""
+
+
 @eqx.filter_jit
-def seen(sky, altitude, mu, mu_s, nu, distance=None):
+def _seen(sky, altitude, mu, mu_s, nu, distance):
     return sky.path(altitude=altitude, mu=mu, mu_s=mu_s, nu=nu, distance=distance)
+
+
+def seen(sky, altitude, mu, mu_s, nu, distance=None):
+    arrays = [altitude, mu, mu_s, nu] if distance is None else [altitude, mu, mu_s, nu, distance]
+    count = len(mu)
+    arrays = [np.pad(np.asarray(x), (0, max(RAYS - count, 0)), mode="edge") for x in arrays]
+    found = _seen(sky, *arrays[:4], None if distance is None else arrays[4])
+    return jax.tree.map(lambda x: np.asarray(x)[:count], found)
 
 
 def rays(count, seed=0):
@@ -198,7 +214,7 @@ def test_light_from_nothing_is_nothing():
     vacuum = replace(
         earth(), rayleigh_scattering=nothing, mie_scattering=nothing, mie_absorption=nothing, ozone_absorption=nothing
     )
-    sky = solved(SMALL, vacuum)
+    sky = solved_once(TINY, vacuum)
     got = seen(sky, *rays(50))
     np.testing.assert_array_equal(got.inscatter, 0)
     np.testing.assert_allclose(got.transmittance, 1, rtol=3e-7)
@@ -210,7 +226,7 @@ def test_light_from_nothing_is_nothing():
 def test_transmittance_along_the_vertical_is_exact():
     """exp(-Σ β H (1 - exp(-top/H))) for air and aerosol, at an entry of the table."""
     air = replace(earth(), ozone_absorption=jnp.zeros(3))
-    sky = solved(replace(SMALL, orders=1, steps=Steps(transmittance=400, single=4)), air)
+    sky = solved_once(replace(TINY, orders=1, steps=Steps(transmittance=400, single=4)), air)
     got = to_top(sky.planet, sky.tables.transmittance, jnp.zeros(()), jnp.ones(()))
     depth = sum(
         tau * (1 - jnp.exp(-air.top_altitude / h))
@@ -241,7 +257,7 @@ def test_equidistant_steps_make_the_aerosol_too_thick_and_gauss_does_not(steps):
     x = top / steps / (2 * height)
     for rule, factor in (("trapezoid", x / np.tanh(x)), ("gauss", 1.0)):
         counted = Steps(transmittance=64, single=steps)
-        sky = solved(replace(SMALL, orders=1, steps=counted, quadrature=rule), air)
+        sky = solved_once(replace(TINY, orders=1, steps=counted, quadrature=rule), air)
         up = look_up(sky.planet, sky.tables.mie, *zenith, jnp.ones(1), jnp.zeros(1, bool))
         np.testing.assert_allclose(up, factor * thin * height, rtol=1e-3)
 
