@@ -34,18 +34,17 @@ FREE = ["mie_scattering", "mie_g", "rayleigh_scattering", "mie_scale_height"]
 TIE = {"mie_scattering": "grey"}
 
 
-def seen(directions, towards, atmosphere=None):
-    sky = Toy().sky(toy_sky.truth() if atmosphere is None else atmosphere)
-    return np.asarray(sky.view(altitude=0.1, sun=jnp.asarray(towards)).radiance(view=jnp.asarray(directions)).radiance)
+@eqx.filter_jit
+def seen(camera, towards, axes, turn, off):
+    """The toy sky by a camera and under a sun that are not quite where they are said to be."""
+    directions, there = rotate(camera.directions(), turn), displace(towards, axes, off)
+    return Toy().sky(toy_sky.truth()).view(altitude=0.1, sun=there).radiance(view=directions).radiance
 
 
 def photo(camera, towards, *, name, turn=(0, 0, 0), off=(0, 0), zoom=1.0, black=0.0, factor=1.0, seed=0, **options):
     """A picture whose camera and sun are not quite where the observation says; black level in units of the median."""
-    directions = rotate(
-        camera.zoomed(zoom).directions() if zoom != 1 else camera.directions(), jnp.asarray(turn, float)
-    )
-    there = displace(jnp.asarray(towards), jnp.asarray(sun_axes(towards)), jnp.asarray(off, float))
-    light = factor * seen(directions, there)
+    there = [jnp.asarray(x, float) for x in (towards, sun_axes(towards), turn, off)]
+    light = factor * np.asarray(seen(camera.zoomed(zoom) if zoom != 1 else camera, *there))
     random = np.random.default_rng(seed)
     noisy = light * (1 + 0.01 * random.standard_normal(light.shape)) + black * np.median(light)
     settings = {"noise": 0.01, "horizon_exclusion": 10 * DEG, "sun_exclusion": 4 * DEG} | options
