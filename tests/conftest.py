@@ -1,5 +1,8 @@
 """Fixtures shared by the whole suite."""
 
+import ctypes
+import os
+from contextlib import suppress
 from pathlib import Path
 
 import equinox as eqx
@@ -12,6 +15,28 @@ import pytest
 from diffatmo.atmosphere import Atmosphere
 
 matplotlib.use("Agg")
+
+
+PROGRAMS_AT_MOST = 2e9
+"""Bytes of memory beyond which compiled programs are dropped: of the thousands that the suite needs, each is kept for ever."""
+
+
+@pytest.fixture(autouse=True)
+def _drop_programs():
+    """Not after every module: files share programs, and a process needs a gigabyte before it has to let go of them."""
+    yield
+    if _resident() > PROGRAMS_AT_MOST:
+        jax.clear_caches()
+        # The C library would keep what is free now for later.
+        with suppress(AttributeError, OSError, TypeError):
+            ctypes.CDLL(None).malloc_trim(0)
+
+
+def _resident() -> float:
+    """Bytes of memory that the process has; 0 where there is no way to know."""
+    with suppress(OSError):
+        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    return 0
 
 
 @pytest.fixture
