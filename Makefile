@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 # Most of the time of the suite goes to the compiler; see diffatmo/compiling.py.
-COMPILE_FAST := --xla_cpu_use_fusion_emitters=false --xla_cpu_experimental_ynn_fusion_type=
+COMPILE_FAST := --xla_cpu_use_fusion_emitters=false --xla_cpu_experimental_ynn_fusion_type= --xla_backend_optimization_level=1
 
 .PHONY: demo test clean
 
