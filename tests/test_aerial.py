@@ -39,7 +39,10 @@ def test_from_nothing_to_the_whole_ray(name):
     directions = SCENE.camera.directions()
     mu, nu = directions[..., 2], directions @ SCENE.sun
     level, mu_s = jnp.full(mu.shape, 0.3), jnp.broadcast_to(SCENE.sun[2], mu.shape)
-    whole = jax.jit(lambda air: model.sky(air).path(altitude=level, mu=mu, mu_s=mu_s, nu=nu))(SCENE.atmosphere)
+    whole = jax.jit(
+        lambda air: model.sky(air).path(altitude=level, mu=mu, mu_s=mu_s, nu=nu),
+        compiler_options={"xla_backend_optimization_level": 0},
+    )(SCENE.atmosphere)
     # moments and raymarch integrate a ray that ends anywhere by another rule.
     np.testing.assert_allclose(endless.inscatter, whole.inscatter, rtol=0.01)
     np.testing.assert_allclose(endless.transmittance, whole.transmittance, atol=3e-3)
@@ -84,7 +87,7 @@ def test_path_tracer_agrees(s1):
     scene = replace(SCENE, atmosphere=s1)
     depth = jnp.full((6, 9), 15.0)
     truth = aerial_perspective(scene, depth, PathTrace(samples=1024, seed=3))
-    got = aerial_perspective(scene, depth)
+    got = aerial_perspective(scene, depth, MODELS["moments"])
     ratio = np.asarray(got.inscatter / truth.inscatter)
     assert abs(ratio.mean() - 1) < 0.01
     np.testing.assert_allclose(got.transmittance, truth.transmittance, atol=2e-3)

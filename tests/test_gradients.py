@@ -72,7 +72,7 @@ def test_forward_and_reverse_against_differences(x64, name, how):
     """Ordinary points to 1e-5 of the largest change; zenith, horizon, g = 0 and no density finite."""
     atmosphere = earth()
     model = make(MODELS[name], atmosphere, how)
-    function, forward = jax.jit(model), jax.jit(jax.jacfwd(model), compiler_options=COMPILE_FAST)
+    function, forward = (jax.jit(f, compiler_options=COMPILE_FAST) for f in (model, jax.jacfwd(model)))
     # One random combination of all outputs: reverse mode of a sum that no coincidence makes right.
     weight = jnp.asarray(np.random.default_rng(5).normal(size=(5, 3)))
     reverse = jax.jit(lambda x: jax.vjp(model, x)[1](weight)[0], compiler_options=COMPILE_FAST)
