@@ -3,6 +3,7 @@
 import ctypes
 import os
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 import equinox as eqx
@@ -11,6 +12,7 @@ import jax.numpy as jnp
 import matplotlib
 import numpy as np
 import pytest
+from few_programs import COMPILE_FAST
 
 from diffatmo.atmosphere import Atmosphere
 
@@ -103,7 +105,8 @@ def check_jacobian():
         def flat(x, *rest):
             return jnp.ravel(function(x, *rest))
 
-        @eqx.filter_jit
+        # Run once for each point: what takes long is compilation.
+        @partial(eqx.filter_jit, compiler_options=COMPILE_FAST)
         def jacobians(x, *rest):
             shifts = step * jnp.eye(x.size)
             around = jax.lax.map(lambda shift: flat(x + shift, *rest), jnp.concatenate([shifts, -shifts]))

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from few_programs import COMPILE_FAST
 
 from diffatmo import sun
 from diffatmo.atmosphere import earth
@@ -41,7 +42,7 @@ def test_from_nothing_to_the_whole_ray(name):
     level, mu_s = jnp.full(mu.shape, 0.3), jnp.broadcast_to(SCENE.sun[2], mu.shape)
     whole = jax.jit(
         lambda air: model.sky(air).path(altitude=level, mu=mu, mu_s=mu_s, nu=nu),
-        compiler_options={"xla_backend_optimization_level": 0},
+        compiler_options=COMPILE_FAST,
     )(SCENE.atmosphere)
     # moments and raymarch integrate a ray that ends anywhere by another rule.
     np.testing.assert_allclose(endless.inscatter, whole.inscatter, rtol=0.01)

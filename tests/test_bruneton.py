@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from few_programs import COMPILE_FAST
 
 from diffatmo.atmosphere import earth
 from diffatmo.models.bruneton import Bruneton, Planet, Sizes, Steps
@@ -27,7 +28,7 @@ def solved(model, atmosphere):
     return model.sky(atmosphere)
 
 
-solved_once = eqx.filter_jit(lambda model, air: model.sky(air), compiler_options={"xla_backend_optimization_level": 0})
+solved_once = eqx.filter_jit(lambda model, air: model.sky(air), compiler_options=COMPILE_FAST)
 """For tables so small that what takes long is compilation."""
 
 

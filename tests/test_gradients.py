@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from few_programs import COMPILE_FAST
 
 from diffatmo.atmosphere import earth
 from diffatmo.models import hillaire
@@ -29,9 +30,6 @@ SMALL = Moments(
     source_degree=3, peak_azimuths=6, order=3, view_steps=3, view_sky=9, view_ground=7, view_columns=5,
     view_fine_columns=9,
 )  # fmt: skip
-COMPILE_FAST = {"xla_backend_optimization_level": 0}
-"""Everything here is computed once or a few times: what takes long is compilation."""
-
 TABLES = Bruneton(sizes=Sizes(8, 16, 4, 8, 4, 8, 6, 4), steps=Steps(19, 5, 5, 4, 4), orders=3, quadrature="gauss")
 """19: with 20, samples of the vertical ray would fall on the very edges of the absorber, where its slope jumps."""
 LUTS = Hillaire((16, 8), (6, 6), (12, 12), hillaire.Steps(19, 5, 5, 5, 3))

@@ -1,12 +1,14 @@
 """Tabulated phase functions: exact for what is linear in nu, equal to a formula that they sample finely, in every model."""
 
 from dataclasses import replace
+from functools import partial
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from few_programs import COMPILE_FAST
 
 import diffatmo
 from diffatmo import atmosphere, phase, sun
@@ -98,7 +100,7 @@ VIEW = sun.direction(
 TOWARDS = sun.direction(zenith=jnp.radians(55.0), azimuth=0.0)
 
 
-@eqx.filter_jit
+@partial(eqx.filter_jit, compiler_options=COMPILE_FAST)
 def seen(model, air):
     return model.sky(air).view(altitude=0.5, sun=TOWARDS).radiance(view=VIEW).radiance
 
