@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from diffatmo._types import Altitude, Cosine, Length, Scalar
-from diffatmo.numerics import safe_divide, safe_sqrt
+from diffatmo.numerics import bounded_divide, safe_sqrt
 
 
 def sine(mu: Cosine) -> Cosine:
@@ -64,7 +64,7 @@ def distance_up(altitude: Altitude, mu: Cosine, target: Altitude, bottom_radius:
     gap = (target - altitude) * (target + altitude + 2 * bottom_radius)
     root = safe_sqrt(r_mu * r_mu + gap)
     # -r mu + root, without its cancellation when mu > 0.
-    ascending = safe_divide(gap, jnp.where(mu > 0, r_mu + root, 1))
+    ascending = bounded_divide(gap, jnp.where(mu > 0, r_mu + root, 1))
     return jnp.maximum(jnp.where(mu > 0, ascending, root - r_mu), 0)
 
 
@@ -73,7 +73,7 @@ def distance_down(altitude: Altitude, mu: Cosine, target: Altitude, bottom_radiu
     r_mu = (bottom_radius + altitude) * mu
     gap = (altitude - target) * (target + altitude + 2 * bottom_radius)
     root = safe_sqrt(r_mu * r_mu - gap)
-    return jnp.maximum(safe_divide(jnp.where(mu < 0, gap, 0), jnp.where(mu < 0, root - r_mu, 1)), 0)
+    return jnp.maximum(bounded_divide(jnp.where(mu < 0, gap, 0), jnp.where(mu < 0, root - r_mu, 1)), 0)
 
 
 def distance_to_boundary(

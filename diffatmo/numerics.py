@@ -33,6 +33,17 @@ def safe_divide(
     return jnp.where(zero, otherwise, numerator / jnp.where(zero, 1, denominator))
 
 
+def bounded_divide(
+    numerator: Float[Array, "..."], denominator: Float[Array, "..."], otherwise: float = 0.0
+) -> Float[Array, "..."]:
+    """numerator / denominator, and ``otherwise`` (with derivative 0) where the denominator is too near 0 for the derivative.
+
+    The derivative has the square of the denominator, which vanishes long before the denominator does.
+    """
+    near = jnp.abs(denominator) <= tiny(jnp.asarray(denominator).dtype)
+    return jnp.where(near, otherwise, numerator / jnp.where(near, 1, denominator))
+
+
 def safe_log(x: Float[Array, "..."]) -> Float[Array, "..."]:
     """log(x), held at the log of the smallest safe number (derivative 0) below it."""
     floor = tiny(jnp.asarray(x).dtype)

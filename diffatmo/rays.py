@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float
 
 from diffatmo import geometry
 from diffatmo._types import Altitude, Cosine, Length, Scalar
-from diffatmo.numerics import gauss_legendre, safe_divide, safe_sqrt
+from diffatmo.numerics import bounded_divide, gauss_legendre, safe_divide, safe_sqrt
 
 STRETCH = 0.15
 """Stretch of the altitude map as a fraction of the atmosphere's thickness: 15 km on Earth, above every scale height."""
@@ -69,14 +69,14 @@ def _piece(
     span = stretch * -jnp.expm1(-(upper[..., None] - lower) / stretch)
     # v + k s reaches sqrt(v² + span) at s = 1.
     end = safe_sqrt(v * v + span)
-    k = safe_divide(span, v + end)
+    k = bounded_divide(span, v + end)
     risen = k * s * (2 * v + k * s)
     shrink = 1 - risen / stretch
     climb = -stretch * jnp.log(shrink)
     altitude = lower + climb
     v_here = safe_sqrt(v * v + climb)
     root = safe_sqrt(altitude + perigee + 2 * radius)
-    slope = 2 * k * safe_divide(v + k * s, shrink * v_here, 1.0) * safe_divide(radius + altitude, root)
+    slope = 2 * k * bounded_divide(v + k * s, shrink * v_here, 1.0) * safe_divide(radius + altitude, root)
     return altitude, v_here * root, slope
 
 
@@ -160,7 +160,7 @@ def trace(
     low, high, sign = (jnp.stack(parts, axis=-1) for parts in zip(*pieces, strict=True))
     v_bottom, bottom = v_bottom[..., None], bottom[..., None]
     rise = jnp.maximum(low - bottom, 0)
-    v_low = v_bottom + safe_divide(rise, v_bottom + safe_sqrt(v_bottom * v_bottom + rise))
+    v_low = v_bottom + bounded_divide(rise, v_bottom + safe_sqrt(v_bottom * v_bottom + rise))
     position = jnp.where(sign[..., None] > 0, s, 1 - s)
     h, z, slope = _piece(low, high, v_low, perigee[..., None], radius, stretch[..., None, None], position)
     distance = jnp.maximum(sign[..., None] * z - r_mu[..., None, None], 0)

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 from diffatmo import geometry, rays
 from diffatmo._types import Altitude, Cosine, Length, OpticalDepth, Scalar, Transmittance
 from diffatmo.atmosphere import Atmosphere
-from diffatmo.numerics import per_parameter, safe_divide, safe_sqrt, scaled_erfcx
+from diffatmo.numerics import bounded_divide, per_parameter, safe_divide, safe_sqrt, scaled_erfcx
 
 _SHELL_STEPS = 3
 """Gauss nodes for the altitude, nearly quadratic in distance, between two shells."""
@@ -107,7 +107,7 @@ def _exponentials_to_top(
     perigee = geometry.perigee_altitude(altitude, mu, radius)
     v = jnp.abs(mu) * safe_sqrt((radius + altitude) / (1 + geometry.sine(mu)))
     rise = jnp.maximum(top - altitude, 0)
-    v_top = v + safe_divide(rise, v + safe_sqrt(v * v + rise))
+    v_top = v + bounded_divide(rise, v + safe_sqrt(v * v + rise))
     lowest = jnp.maximum(perigee, 0)
     scale_height = heights.reshape(-1, *[1] * v.ndim)
     here = _rising(altitude, perigee, v, scale_height, radius)

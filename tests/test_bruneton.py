@@ -14,7 +14,7 @@ from diffatmo.models.bruneton import Bruneton, Planet, Sizes, Steps
 from diffatmo.models.bruneton.precomputation import look_up
 from diffatmo.models.raymarch import RayMarch
 from diffatmo.models.tables import PARAMETERISATIONS, bilinear
-from diffatmo.models.transmittance_table import to_top
+from diffatmo.models.transmittance_table import between, to_top
 
 SMALL = Bruneton(sizes=Sizes(32, 128, 8, 32, 16, 64, 24, 8), steps=Steps(64, 20, 20, 8, 16), orders=2)
 TINY = replace(SMALL, sizes=Sizes(8, 16, 4, 8, 4, 8, 6, 4))
@@ -276,3 +276,17 @@ def test_equidistant_steps_make_the_aerosol_too_thick_and_gauss_does_not(steps):
 def test_sizes_that_cannot_be_are_refused(options, named):
     with pytest.raises(ValueError, match=named):
         Bruneton(**options)
+
+
+@pytest.mark.parametrize("ground", [False, True])
+def test_derivatives_through_air_that_lets_next_to_nothing_pass(ground):
+    """Two entries of 1e-30, whose square no number in single precision is: darkness, and no derivative that is infinite."""
+    planet = SMALL.planet(earth())
+    table = jnp.full((SMALL.sizes.transmittance_r, SMALL.sizes.transmittance_mu, 1), 1e-30, jnp.float32)
+
+    def passes(table):
+        at = (jnp.float32(x) for x in (1.0, -0.5 if ground else 0.5, 0.1))
+        return between(planet, table, *at, jnp.asarray(ground))[0]
+
+    assert 0 <= float(passes(table)) <= 1
+    assert jnp.isfinite(jax.grad(passes)(table)).all()

@@ -91,3 +91,13 @@ def test_derivatives_are_finite(x64, h, mu):
     assert jnp.isfinite(everything(x)).all()
     assert jnp.isfinite(jax.jacfwd(everything)(x)).all()
     assert jnp.isfinite(jax.jacrev(everything)(x)).all()
+
+
+@pytest.mark.parametrize("mu", [1e-25, -1e-25])
+@pytest.mark.parametrize("function", [geometry.distance_up, geometry.distance_down])
+def test_derivatives_along_a_ray_that_is_horizontal_but_for_rounding(function, mu):
+    """From the target itself: the cosine is there, its square is not."""
+    at = jnp.float32(100.0), jnp.float32(mu), jnp.float32(100.0), jnp.float32(6360.0)
+    assert float(function(*at)) == pytest.approx(0, abs=1e-15)
+    assert all(jnp.isfinite(slope) for slope in jax.grad(function, argnums=(0, 1, 2, 3))(*at))
+    assert all(jnp.isfinite(slope) for slope in jax.jacfwd(function, argnums=(0, 1, 2, 3))(*at))

@@ -17,6 +17,7 @@ from diffatmo import numerics
         (numerics.safe_log, [-1.0, 0.0, 1e-30, 2.0]),
         (numerics.safe_arccos, [-2.0, -1.0, 0.3, 1.0, 2.0]),
         (lambda x: numerics.safe_divide(1 + x, x), [0.0, 2.0]),
+        (lambda x: numerics.bounded_divide(1 + x, x), [0.0, 1e-30, -1e-30, 2.0]),
         (lambda x: numerics.safe_norm(jnp.stack([x, x])), [0.0, 1.0]),
     ],
 )

@@ -112,3 +112,15 @@ def test_derivatives_are_finite_and_right(x64, h, mu):
         step = 1e-5
         numeric = [(f(x.at[i].add(step)) - f(x.at[i].add(-step))) / (2 * step) for i in (0, 1)]
         np.testing.assert_allclose(exact, numeric, rtol=1e-5)
+
+
+def test_derivatives_at_the_top_along_a_ray_that_is_horizontal_but_for_rounding():
+    """Nothing is left to cross, and the square of the cosine is less than the least number."""
+
+    def columns(altitude, mu):
+        return transmittance.to_top(earth(), altitude, mu)[0]
+
+    at = jnp.float32(100.0), jnp.float32(1e-25)
+    np.testing.assert_allclose(columns(*at).exponential, 0, atol=1e-4)
+    for derivative in (jax.jacfwd, jax.jacrev):
+        assert all(jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(derivative(columns, argnums=(0, 1))(*at)))

@@ -8,7 +8,7 @@ from diffatmo import geometry
 from diffatmo._types import Altitude, Cosine, Length, Transmittance
 from diffatmo.atmosphere import Atmosphere
 from diffatmo.models.tables import Planet, bilinear
-from diffatmo.numerics import safe_divide
+from diffatmo.numerics import bounded_divide
 
 SUN_ANGULAR_RADIUS = 0.00935 / 2
 """rad; that of Bruneton's demonstration of 2017. Over this range of its height the sun sets."""
@@ -81,7 +81,7 @@ def _ratio(
     here_up = to_top(planet, transmittance, altitude, sign * mu)
     there_up = to_top(planet, transmittance, there, sign * mu_there)
     down = ground[..., None]
-    return jnp.minimum(safe_divide(jnp.where(down, there_up, here_up), jnp.where(down, here_up, there_up)), 1)
+    return jnp.minimum(bounded_divide(jnp.where(down, there_up, here_up), jnp.where(down, here_up, there_up)), 1)
 
 
 def sun_seen(planet: Planet, altitude: Altitude, mu_s: Cosine, sun_angular_radius: float) -> Float[Array, "..."]:
