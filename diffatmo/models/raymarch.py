@@ -1,5 +1,6 @@
 """Single scattering only, integrated ray by ray: the seed of every sky tutorial, and the exact first order of the others."""
 
+import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -81,8 +82,8 @@ class RayMarchSky(Sky):
     """A sky of light scattered once, over a ground lit by the sun alone."""
 
     atmosphere: Atmosphere
-    steps: int
-    light_steps: int | None
+    steps: int = eqx.field(static=True)
+    light_steps: int | None = eqx.field(static=True)
 
     def path(self, *, altitude: Altitude, mu: Cosine, mu_s: Cosine, nu: Cosine, distance: Length | None = None) -> Path:
         """Inscattered radiance and transmittance to the boundary, or to ``distance`` km if that is nearer."""

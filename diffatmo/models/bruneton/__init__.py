@@ -5,6 +5,7 @@ in accuracy is part of it: linear interpolation of eight entries in nu, the prod
 function, ratios of transmittances. Where that matters, :class:`~diffatmo.models.moments.Moments` is the model to use.
 """
 
+import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
@@ -88,8 +89,8 @@ class BrunetonSky(Sky):
     atmosphere: Atmosphere
     planet: Planet
     tables: Tables
-    sun_angular_radius: float
-    packed: bool
+    sun_angular_radius: float = eqx.field(static=True)
+    packed: bool = eqx.field(static=True)
 
     def path(self, *, altitude: Altitude, mu: Cosine, mu_s: Cosine, nu: Cosine, distance: Length | None = None) -> Path:
         """Inscattered radiance and transmittance to the boundary, or to ``distance`` km if that is nearer."""
