@@ -46,6 +46,7 @@ from fitting.linearisation import derivatives, linearise
 from fitting.nuisances import gather
 from fitting.observation import FIXED, NOISE, PER_CHANNEL, Observation, observe, sigma
 from fitting.parameters import Coordinates, Parameters, select
+from fitting.priors import Prior, Priors, collect
 from fitting.problem import Problem, light, planet_shell, weights
 from fitting.quantities import DERIVED, Quantity, numbers, quantities
 from fitting.solve import evaluated, pose
@@ -241,6 +242,19 @@ def of_observations(observations: Sequence[Observation], parameters: Parameters,
     problem = replace(problem, weight=weights(batch, light(y, found.radiance, problem)))
     found = evaluated(*problem.split(y), problem)
     return _information(y, np.asarray(found.rows, float), problem, [label.name for label in labels])
+
+
+def of_priors(priors: Sequence[Prior], parameters: Parameters) -> Information:
+    """What is known besides any image."""
+    known = collect(priors, parameters)
+    if known is None:
+        return nothing(parameters.size)
+    slope = np.asarray(outermost(_prior_slope)(parameters.start, parameters, known), dtype=np.float64)
+    return Information((), slope)
+
+
+def _prior_slope(y: Coordinates, parameters: Parameters, known: Priors) -> Float[Array, "k n"]:
+    return jax.jacfwd(lambda y: known.residuals(parameters.atmosphere(y)))(y)
 
 
 def _check_finite(bad: Int[np.ndarray, "image 2"], names: Sequence[str]) -> None:
@@ -481,6 +495,7 @@ def plan(
     atmosphere: Atmosphere,
     free: Sequence[str],
     tie: Mapping[str, str] | None = None,
+    priors: Sequence[Prior] = (),
     aims: Sequence[str] | None = None,
     shots: Sequence[Shot] | None = None,
     ranked_only: Sequence[Shot] = (),
@@ -494,7 +509,7 @@ def plan(
     Args:
         observations: The images there are, from :func:`fitting.observe`; may be none.
         atmosphere: The best that is known, about which everything is taken to be linear.
-        free: Parameters, and ``tie`` their ties, as in :func:`fitting.fit`.
+        free: Parameters, ``tie`` their ties, and ``priors`` what is known of them, as in :func:`fitting.fit`.
         aims: Names of the fields, derived ones, or single numbers that matter; by default all that are free. Each counts
             once, however many wavelengths it has.
         shots: To choose from; by default :func:`candidates`.
@@ -528,7 +543,7 @@ def plan(
     parts = of_shots(offered, parameters, sky, sensor=own_sensor, altitude=level)
     if ahead is not None:
         ahead.join()
-    before = of_observations(observations, parameters, sky)
+    before = combined([of_priors(priors, parameters), of_observations(observations, parameters, sky)])
     sequence: list[Prospect] = []
     known, left = before, list(zip(chosen, parts[: len(chosen)], strict=True))
     while left and len(sequence) < count:

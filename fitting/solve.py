@@ -343,7 +343,8 @@ def solve(
 
     def keep(y: Coordinates, step_size: float) -> None:
         nonlocal checkpoint
-        if checkpoint is not None:
+        # Of several processes, which all come here with the same, one writes.
+        if checkpoint is not None and jax.process_index() == 0:
             try:
                 rows = [step._asdict() for step in history]
                 save(checkpoint, identity, Checkpoint(np.asarray(y), step_size, final, rows))

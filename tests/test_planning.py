@@ -218,6 +218,17 @@ def test_what_no_shot_can_tell_stays_undetermined():
     assert errors["fixed"]["solar_irradiance"] is not None
 
 
+def test_what_is_known_beforehand_counts_as_another_measurement():
+    """Precisions add: of one number exactly."""
+    prior = fitting.Prior("mie_g", 0.8, 1e-3)
+    wanted = {"atmosphere": toy_sky.truth(), "free": ["mie_g"], "shots": SHOTS[:1], "count": 1, "model": Toy()}
+    alone, known = planning.plan([], **wanted), planning.plan([], priors=[prior], **wanted)
+    assert alone.standard_errors == [None]
+    assert known.standard_errors == [pytest.approx(1e-3, rel=1e-5)]
+    (shot,), (both,) = alone.sequence[0].standard_errors, known.sequence[0].standard_errors
+    assert 1 / both**2 == pytest.approx(1 / shot**2 + 1e6, rel=1e-4)
+
+
 def test_ranking_and_sequence():
     images = toy_sky.observations(zeniths=(40.0,), exposure=("camera",))
     shots = [replace(shot, exposure="camera") for shot in SHOTS]

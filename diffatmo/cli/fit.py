@@ -68,6 +68,13 @@ MAX_STEPS = 100
     help="Images of a FOLDER fitted at a time; each takes 1 to 2 GB of memory.  [default: one for every two cores, up to 8]",
 )
 @click.option(
+    "--hosts",
+    nargs=3,
+    type=(str, click.IntRange(min=2), click.IntRange(min=0)),
+    metavar="ADDRESS:PORT COUNT NUMBER",
+    help="Share out the pixels of a joint fit: this is process NUMBER of COUNT, of which 0 is at ADDRESS and writes DIR.",
+)
+@click.option(
     "--resume",
     is_flag=True,
     help="Go on with a fit that was broken off; of a FOLDER, fit only what has no complete result.",
@@ -95,6 +102,7 @@ def fit(
     profile: str | None,
     each: bool,
     processes: int | None,
+    hosts: tuple[str, int, int] | None,
     resume: bool,
     output: Path,
     overwrite: bool,
@@ -126,25 +134,47 @@ def fit(
     if each or any(image.is_dir() for image in images):
         if not images and not config:
             raise InputError("--each: no IMAGE, FOLDER or --config says what to fit")
+        if hosts:
+            raise InputError("--hosts is for a joint fit; of a FOLDER, give each host images of its own")
         mask = Path(options["mask"]) if "mask" in options else None
         (spec,) = plan(many.expand(images, mask=mask), config, options, output).values()
         spec, fitter = spec.override(**override), many.Fitter(prepare, run_quietly)
         return many.fit_each(spec, output, fitter, jobs=processes, resume=resume, overwrite=overwrite)
     if processes:
         raise InputError("--jobs is for the images of a FOLDER, or with --each")
+    first = join(hosts)
     specs = plan(images, config, options, output)
     # All that can be wrong is found before the first fit, which is written as soon as it is done.
     jobs = {directory: prepare(spec.override(**override)) for directory, spec in specs.items()}
     from fitting import checkpoint, report
 
     begun = {directory: check_begun(directory, resume=resume, overwrite=overwrite) for directory in jobs}
-    for directory in jobs:
-        report.check_writable(directory, overwrite=overwrite or begun[directory])
-    if overwrite:
+    if first:
         for directory in jobs:
-            (directory / checkpoint.FILE).unlink(missing_ok=True)
-    converged = [run(job, directory, overwrite=overwrite or begun[directory]) for directory, job in jobs.items()]
+            report.check_writable(directory, overwrite=overwrite or begun[directory])
+            if overwrite:
+                (directory / checkpoint.FILE).unlink(missing_ok=True)
+    converged = [
+        run(job, directory, overwrite=overwrite or begun[directory], quiet=not first, write=first)
+        for directory, job in jobs.items()
+    ]
     return 0 if all(converged) else NOT_CONVERGED
+
+
+def join(hosts: tuple[str, int, int] | None) -> bool:
+    """Meet the other processes, if there are any; whether this is the one that speaks and writes."""
+    if hosts is None:
+        return True
+    import jax
+
+    address, count, number = hosts
+    if number >= count:
+        raise InputError(f"--hosts: got number {number} of {count} processes, expected 0 to {count - 1}")
+    try:
+        jax.distributed.initialize(address, count, number)
+    except RuntimeError as error:
+        raise InputError(f"--hosts: {address}: the processes have not met: {error}") from error
+    return number == 0
 
 
 def check_begun(directory: Path, *, resume: bool, overwrite: bool) -> bool:
@@ -275,7 +305,7 @@ def fitting_model(name: str) -> "Model":
     return Bruneton.reduced() if name == "bruneton" else make_model(name)
 
 
-def run(job: Job, directory: Path, *, overwrite: bool, quiet: bool = False) -> bool:
+def run(job: Job, directory: Path, *, overwrite: bool, quiet: bool = False, write: bool = True) -> bool:
     """Fit, write the report, show the table unless ``quiet``; whether the fit converged."""
     from rich.text import Text
 
@@ -323,6 +353,8 @@ def run(job: Job, directory: Path, *, overwrite: bool, quiet: bool = False) -> b
             result = fitting.profile(result, *job.profile, progress=show_point)
         elif job.profile:
             console.print("No profiles: they are about an optimum, and none was found.")
+        if not write:
+            return result.converged
         report.write(result, directory, truth=job.truth, overwrite=overwrite)
     if result.message != INTERRUPTED:
         file.unlink(missing_ok=True)

@@ -158,6 +158,7 @@ def _find(
         atmosphere=at,
         free=job.free,
         tie=job.tie,
+        priors=job.priors,
         aims=aims,
         shots=planning.candidates(zeniths, [exposure]),
         ranked_only=planning.candidates(zeniths, [_other(exposure)]),
