@@ -84,7 +84,9 @@ def shipped_bars(name: str) -> list[float]:
             [sys.executable, "-m", "diffatmo", "fit", "--config", scene, "-o", out], check=True, capture_output=True
         )
         found = json.loads((out / "fit.json").read_text())
-    return [estimate["standard_error"] for estimate in found["parameters"]]
+    # In the order of FitResult.parameters: a spectral number after the other, then what is derived.
+    every = [*found["parameters"].values(), *found["derived"].values()]
+    return [error for estimate in every for error in np.ravel(estimate["standard_error"])]
 
 
 def main(count: int, names: list[str]) -> None:
