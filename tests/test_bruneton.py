@@ -290,3 +290,14 @@ def test_derivatives_through_air_that_lets_next_to_nothing_pass(ground):
 
     assert 0 <= float(passes(table)) <= 1
     assert jnp.isfinite(jax.grad(passes)(table)).all()
+
+
+def test_what_is_at_the_lens_is_seen_through_the_thickest_haze():
+    """Along the ground T to the top is less than any number; over no distance it is 1, and over 200 m that of the exact sum."""
+    haze = replace(earth(), mie_scattering=jnp.full(3, 1.0), mie_absorption=jnp.full(3, 0.1))
+    sky, exact = solved(replace(SMALL, orders=1), haze), RayMarch().sky(haze)
+    at = [jnp.full(3, 0.001), jnp.array([0.0, 0.01, -0.002]), *(jnp.full(3, x) for x in (0.5, 0.5))]
+    near, far = (seen(sky, *at, jnp.full(3, d)) for d in (0.0, 0.2))
+    np.testing.assert_allclose(near.transmittance, 1, atol=1e-4)
+    np.testing.assert_allclose(near.inscatter, 0, atol=1e-4 * np.max(seen(sky, *at).inscatter))
+    np.testing.assert_allclose(far.transmittance, seen(exact, *at, jnp.full(3, 0.2)).transmittance, rtol=1e-3)

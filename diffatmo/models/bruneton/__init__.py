@@ -9,14 +9,14 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from diffatmo import geometry, phase
-from diffatmo._types import Altitude, Cosine, Irradiance, Length
+from diffatmo import geometry, phase, transmittance
+from diffatmo._types import Altitude, Cosine, Irradiance, Length, Transmittance
 from diffatmo.atmosphere import Atmosphere
 from diffatmo.models.base import Model, Path, Sky
 from diffatmo.models.bruneton.precomputation import GAUSS, QUADRATURES, TRAPEZOID, Steps, Tables, look_up, precompute
 from diffatmo.models.tables import PARAMETERISATIONS, Planet, Sizes, bilinear
 from diffatmo.models.transmittance_table import SUN_ANGULAR_RADIUS, between, to_ground, to_sun, to_top
-from diffatmo.numerics import safe_divide
+from diffatmo.numerics import safe_divide, tiny
 
 __all__ = ["Bruneton", "BrunetonSky", "Planet", "Sizes", "Steps", "Tables"]
 
@@ -106,10 +106,10 @@ class BrunetonSky(Sky):
             # S(a→b) = S(a→c) - T(a→b) S(b→c), c the end of the ray (paper, section 4).
             reach = jnp.clip(distance - moved, 0, end)
             whole = reach >= end
-            part = between(planet, self.tables.transmittance, altitude, mu, reach, ground)
-            survives = jnp.where(whole[..., None], survives, part)
             there = planet.altitude_after(altitude, mu, reach)
             mu_there = planet.cosine_after(altitude, mu, 1.0, reach, there)
+            part = self._between(altitude, mu, there, mu_there, reach, ground)
+            survives = jnp.where(whole[..., None], survives, part)
             mu_s_there = planet.cosine_after(altitude, mu_s, nu, reach, there)
             beyond = self._scattered(there, mu_there, mu_s_there, nu, ground)
             air, aerosol = (
@@ -121,6 +121,32 @@ class BrunetonSky(Sky):
             + phase.mie(nu, self.atmosphere.mie_g, self.atmosphere.mie_phase)[..., None] * aerosol
         )
         return Path(jnp.where(misses[..., None], 0, light), jnp.where(misses[..., None], 1, survives))
+
+    def _between(
+        self,
+        altitude: Altitude,
+        mu: Cosine,
+        there: Altitude,
+        mu_there: Cosine,
+        reach: Length,
+        ground: Bool[Array, "..."],
+    ) -> Transmittance:
+        """T over the first ``reach`` km of a ray, to a point at ``there``.
+
+        A ratio of two entries of the table, where it has a number for them. Along the ground through haze it has none: there
+        the difference of the two optical depths, from their closed form.
+        """
+        table, sign = self.tables.transmittance, jnp.where(ground, -1.0, 1.0)
+        nearer_top = jnp.where(ground, altitude, there), sign * jnp.where(ground, mu, mu_there)
+        known = to_top(self.planet, table, *nearer_top) > tiny(table.dtype)
+        depths = [
+            transmittance.optical_depth(self.atmosphere, transmittance.to_top(self.atmosphere, h, sign * m)[0])
+            for h, m in ((altitude, mu), (there, mu_there))
+        ]
+        depth = jnp.where(known, 0, sign[..., None] * (depths[0] - depths[1]))
+        return jnp.where(
+            known, between(self.planet, table, altitude, mu, reach, ground), jnp.exp(-jnp.maximum(depth, 0))
+        )
 
     def _scattered(
         self, altitude: Altitude, mu: Cosine, mu_s: Cosine, nu: Cosine, ground: Bool[Array, "..."]
