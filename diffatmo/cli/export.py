@@ -29,6 +29,7 @@ PHASES = {
     "henyey-greenstein": "1 / (4 π) (1 - g²) / (1 + g² - 2 g nu)^(3/2)",
     "cornette-shanks": "3 / (8 π) (1 - g²) (1 + nu²) / ((2 + g²) (1 + g² - 2 g nu)^(3/2))",
 }
+TABLE = "the table of the atmosphere file, linear in nu between its angles, divided by its integral over all directions"
 
 
 @click.command()
@@ -107,8 +108,7 @@ def _bruneton(air: "Atmosphere", parameterisation: str, orders: int) -> "tuple[l
         "parameterisation": parameterisation,
         "bottom": f"{float(air.bottom_radius):g}",
         "top": f"{float(air.top_radius):g}",
-        "phase": PHASES[air.mie_phase] if isinstance(air.mie_phase, str) else "the table of the atmosphere file",
-        "g": f"{float(air.mie_g):g}",
+        "phase": f"{PHASES[air.mie_phase]}, g = {float(air.mie_g):g}" if isinstance(air.mie_phase, str) else TABLE,
         "mu_s_min": f"{model.mu_s_min:g}",
         "t_mu": sizes.transmittance_mu,
         "t_r": sizes.transmittance_r,
@@ -148,7 +148,7 @@ def _hillaire(
         "s_u": model.sky_view_size[0],
         "s_v": model.sky_view_size[1],
         "s_half": model.sky_view_size[1] // 2,
-        "slices": textures[-1].texels.shape[0],
+        **dict(zip(("slices", "a_y", "a_x"), textures[-1].texels.shape[:3], strict=True)),
         "reach": f"{reach:g}",
     }
     return textures, "Hillaire 2020; transmittance as Bruneton 2017", facts
