@@ -176,7 +176,11 @@ def _sheet(scene: "Scene", outcomes: "dict[str, Outcome]", truth: str) -> "Figur
             panel.imshow(figures.diverging(errors[name][..., band], scale), interpolation="nearest")
             figures.bare(panel, f"{float(wavelengths[band]):g} nm" if name != truth else "truth")
     bar = figure.colorbar(
-        ScalarMappable(Normalize(-100 * scale, 100 * scale), "RdBu_r"), ax=list(axes[1:].flat), shrink=0.6, pad=0.01
+        ScalarMappable(Normalize(-100 * scale, 100 * scale), "RdBu_r"),
+        ax=list(axes[1:].flat),
+        shrink=0.6,
+        pad=0.01,
+        extend="both",
     )
     bar.set_label(f"relative to {truth}, %", fontsize=8)
     return figure
@@ -231,8 +235,9 @@ def _write(
             f"<title>diffatmo compare</title><style>{report.STYLE}</style>",
             "<h1>One sky, several models</h1>",
             f"<p class=soft>Relative differences to {truth}, weighted by solid angle, over all wavelengths and more than "
-            f"{comparison.SUN_DEG:g}° from the sun. Tables are what does not depend on where one looks. Times are those of the "
-            "machine that made this page.</p>",
+            f"{comparison.SUN_DEG:g}° from the sun. Noise is the standard error that the path tracer brings along. Tables are "
+            "what does not depend on where one looks. Times are those of the machine that made this page; the path tracer's "
+            "have its compilation in them.</p>",
             f"<table>{cells}</table>",
             report.figure_tag(sheet, "Above: the pictures, through one exposure. Below: the error at each wavelength."),
             f"<h2>Scene</h2><pre>{html.escape(scenes.dumps(scene))}</pre></html>",
