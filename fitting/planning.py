@@ -41,6 +41,7 @@ from diffatmo.numerics import safe_log
 from fitting._errors import FitError
 from fitting.batch import Batch, stack
 from fitting.elimination import eliminate, starting, without
+from fitting.evaluation import evaluated, pose
 from fitting.least_squares import known_rows, slopes, triangle
 from fitting.linearisation import derivatives, linearise
 from fitting.nuisances import gather
@@ -49,7 +50,6 @@ from fitting.parameters import Coordinates, Parameters, select
 from fitting.priors import Prior, Priors, collect
 from fitting.problem import Problem, light, planet_shell, weights
 from fitting.quantities import DERIVED, Quantity, numbers, quantities
-from fitting.solve import evaluated, pose
 from fitting.uncertainty import propagate
 
 VAGUE = 3.0

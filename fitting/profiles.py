@@ -26,6 +26,7 @@ from jaxtyping import Array, Float
 
 from diffatmo.compiling import outermost
 from fitting._errors import FitError
+from fitting.evaluation import evaluated, restored
 from fitting.findings import Estimate, Profile
 from fitting.least_squares import known_rows, reduce
 from fitting.linearisation import Linearisation
@@ -36,7 +37,6 @@ from fitting.problem import Linear, Problem, whitened
 from fitting.quantities import numbers
 from fitting.result import FitResult
 from fitting.search import INTERRUPTED, minimise
-from fitting.solve import evaluated, restored
 from fitting.uncertainty import propagate
 
 POINTS = 13

@@ -52,6 +52,9 @@ LARGEST_MISFIT = 100.0
 ASTRAY = 2.0
 """Reduced χ² beyond which the search from the given start is not trusted to have found the best minimum."""
 
+FIRST_PASS_TOLERANCE = 1.0
+"""The first pass only has to find the sigma of the second: one standard error from its optimum is near enough."""
+
 AGAIN, AGAIN_AT_MOST = 0.1, 4
 """Fall of a robust χ² with the linear nuisances, in its unit, for which the pixels are gone through again; how often."""
 
@@ -253,6 +256,21 @@ def minimise(
     return best
 
 
+def steps_left(history: list[Step], tolerance: float) -> int | None:
+    """How many more steps a fit will take, if its distances go on to shrink as they did last; None while none can tell."""
+    stage = history[-1].stage
+    accepted = [step.distance for step in history if step.stage == stage and step.accepted]
+    aim = tolerance if stage > 1 else max(tolerance, FIRST_PASS_TOLERANCE)
+    # Each further pass begins near its optimum; the last is that of a finer model.
+    more = 2 * max(3 - stage, 0)
+    if accepted and accepted[-1] <= aim:
+        return more
+    if len(accepted) < 3 or not 0 < accepted[-1] < accepted[-3]:
+        return None
+    rate = math.sqrt(accepted[-1] / accepted[-3])
+    return math.ceil(math.log(aim / accepted[-1]) / math.log(rate)) + more
+
+
 def _settled(
     x: Coordinates, found: Linearisation, problem: Problem, evaluate: Evaluate
 ) -> tuple[Coordinates, Linearisation, Factor]:
@@ -298,8 +316,3 @@ def _end(away: float, rejections: int, tolerance: float) -> tuple[bool, str] | N
     if rejections >= REJECTIONS_AT_MOST:
         return False, f"stopped: no step improves the fit, {away:.2g} standard errors from where the optimum should be"
     return None
-
-
-def _count(batch: Batch) -> int:
-    """Number of residuals."""
-    return int(np.sum(np.asarray(batch.used))) * batch.measured.shape[-1]

@@ -17,14 +17,13 @@ from the fitted one.
 import math
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
-from functools import partial
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
+from threading import Thread
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -37,27 +36,23 @@ from fitting import model_error
 from fitting._errors import FitError
 from fitting.batch import Batch, stack
 from fitting.checkpoint import Checkpoint, digest, load, save
-from fitting.devices import collected, gathered, mesh_of, placed
+from fitting.devices import mesh_of
 from fitting.elimination import starting
+from fitting.evaluation import corrected, evaluated, pose, rescaled, weighed
 from fitting.least_squares import Factor, known_rows, reduce_images
 from fitting.linearisation import Linearisation, linearise
 from fitting.nuisances import Label, gather
 from fitting.observation import Observation, sigma
 from fitting.parameters import Coordinates, Parameters, select
-from fitting.priors import Prior, collect
-from fitting.problem import Linear, Predicted, Problem, expected, light, planet_shell, weights, whitened
-from fitting.robust import Loss, scale
-from fitting.search import ASTRAY, INTERRUPTED, Point, Progress, Step, count, minimise
-from fitting.smooth import Fields
+from fitting.priors import Prior
+from fitting.problem import Linear, Problem, expected, planet_shell, whitened
+from fitting.search import ASTRAY, FIRST_PASS_TOLERANCE, INTERRUPTED, Point, Progress, Step, count, minimise
 from fitting.starts import APART, RIVAL, ranked, separation
 
 TOLERANCE = 0.1
 """Distance to the optimum, in standard errors, at which the fit has converged."""
 
 MAX_STEPS = 100
-
-FIRST_PASS_TOLERANCE = 1.0
-"""The first pass only has to find the sigma of the second: one standard error from its optimum is near enough."""
 
 LARGEST_SIGNAL = 1e9
 """Signal over noise, of a pixel, whose square can be summed in single precision."""
@@ -74,9 +69,6 @@ OTHERS = 3
 HOPELESS_MISFIT = 1e4
 """Reduced χ² of images that have nothing to do with the model: another unit, another exposure."""
 
-FIELD_DEGREE = 3
-"""Degree in direction up to which the model's errors are correlated."""
-
 SETTLED = 0.9
 """Ratio of the scales of a robust loss, from one stage to the next, above which it does not fall any further."""
 
@@ -85,10 +77,6 @@ UNLIKE = (
 )
 ELSEWHERE = "{}; from one of {} other starts, as the one given leads to a χ² {:.2g} times as large"
 TOO_COARSE = "converged, but the model's finer self differs from it by {:.0%}: the error bars do not hold"
-
-
-Begin = Callable[[Coordinates, Problem], tuple[Coordinates, Linearisation]]
-"""From ``x`` to ``y``, with a start for the linear nuisances, and the linearisation there."""
 
 
 class Solution(NamedTuple):
@@ -129,52 +117,134 @@ class Solution(NamedTuple):
         return self.residual_count - self.y.size
 
 
-def pose(batch: Batch, parameters: Parameters, priors: Sequence[Prior], loss: str | None, model: Model) -> Problem:
-    """The problem with weights from the measured signal; what is known of the planet is no more than its form yet."""
-    signal, shell = batch.measured, eqx.filter_eval_shape(planet_shell, model, parameters)
-    robust = None if loss is None else Loss(loss, jnp.ones((), signal.dtype))
-    fields = Fields.of(batch, FIELD_DEGREE)
-    weight = outermost(weights)(batch, signal)
-    return Problem(
-        model, parameters, batch, weight, shell, jnp.ones_like(signal), collect(priors, parameters), robust, fields
-    )
+class _Found(NamedTuple):
+    """The best point of a pass, other minima, and what the search from the given start led to if there were others."""
+
+    best: Point
+    rivals: list[Point]
+    problem: Problem
+    tried: int = 0
+    given: float = math.nan
+
+    @property
+    def interrupted(self) -> bool:
+        return self.best.message == INTERRUPTED
 
 
-def evaluated(x: Coordinates, linear: Linear, problem: Problem) -> Linearisation:
-    """The linearisation at ``x``, computed."""
-    mesh = problem.batch.mesh
-    found = outermost(linearise)(x, linear, placed(problem))
-    return collected(jax.block_until_ready(found), mesh)
+@dataclass
+class _Run:
+    """A fit on its way: what has been done, what is left to be spent, and where it is kept."""
+
+    tolerance: float
+    max_steps: int
+    progress: Progress | None
+    checkpoint: Path | None
+    identity: str
+    history: list[Step] = field(default_factory=list)
+    seconds: list[float] = field(default_factory=list)
+    final: bool = False
+    """Whether sigma comes from the fitted signal."""
+    step_size: float | None = None
+    """That of a search that was broken off, for the one that goes on; any other begins with its own."""
+
+    def evaluate(self, x: Coordinates, linear: Linear, problem: Problem) -> Linearisation:
+        before = time.perf_counter()
+        result = evaluated(x, linear, problem)
+        self.seconds.append(time.perf_counter() - before)
+        return result
+
+    def begin(self, x: Coordinates, problem: Problem) -> tuple[Coordinates, Linearisation]:
+        """``y`` with a start for the linear nuisances, and the linearisation there."""
+        found = self.evaluate(x, jnp.zeros(problem.batch.nuisances.linear, x.dtype), problem)
+        linear = jnp.asarray(starting(np.asarray(found.radiance), problem.batch), x.dtype)
+        # Residuals of another exposure are differences of large numbers, and the weights of a robust loss are those of one.
+        if np.any(np.abs(linear) > (0.1 if problem.loss is None else 0)):
+            found = self.evaluate(x, linear, problem)
+        return jnp.concatenate([x, linear]), found
+
+    def search(
+        self, y: Coordinates, problem: Problem, tolerance: float, *, aside: bool = False, steps: int = 0, **options: Any
+    ) -> Point:
+        """A search from ``y`` in up to ``steps`` more; one that is not ``aside`` is what a fit goes on from."""
+        step_size, self.step_size = (None if aside else self.step_size), None
+        return minimise(
+            y,
+            problem,
+            evaluate=self.evaluate,
+            tolerance=tolerance,
+            max_steps=len(self.history) + steps if steps else self.max_steps,
+            history=self.history,
+            progress=self.progress,
+            keep=(lambda *_: None) if aside else self.keep,
+            step_size=step_size,
+            **options,
+        )
+
+    def keep(self, y: Coordinates, step_size: float) -> None:
+        """Write the best point to the checkpoint. Of several processes, which all come here with the same, one does."""
+        if self.checkpoint is None or jax.process_index() > 0:
+            return
+        rows = [step._asdict() for step in self.history]
+        try:
+            save(self.checkpoint, self.identity, Checkpoint(np.asarray(y), step_size, self.final, rows))
+        except FitError as error:
+            warnings.warn(f"{error}; the fit goes on without a checkpoint", stacklevel=2)
+            self.checkpoint = None
 
 
-def _corrected(y: Coordinates, radiance: Predicted, problem: Problem, finer: Model) -> Problem:
-    """``problem`` with the correction of its model by a finer one at ``y``."""
-    x, mesh = problem.split(y)[0], problem.batch.mesh
-    found = outermost(model_error.correction)(x, placed(problem), radiance, finer)
-    return replace(problem, correction=gathered(jax.block_until_ready(found), mesh))
+def _first_pass(run: _Run, y: Coordinates, start: Linearisation, problem: Problem, starts: int | None) -> _Found:
+    """The optimum with sigma from the measured signal, to one standard error, from here or from elsewhere.
+
+    The scale of a robust loss follows the residuals: while the fit gets better, fewer pixels pass for outliers.
+    """
+    rough = max(run.tolerance, FIRST_PASS_TOLERANCE)
+    known: Linearisation | None = start if problem.loss is None else None
+    here, radiance, scales = y, start.radiance, [math.inf]
+    found: _Found | None = None
+    while True:
+        problem = rescaled(here, radiance, problem)
+        patience = PATIENCE if starts is None and found is None else None
+        fallback = None if found is None else found.best
+        best = run.search(y, problem, rough, start=known, patience=patience, fallback=fallback)
+        found = found._replace(best=best, problem=problem) if found else _rescued(run, best, problem, starts, rough)
+        if found.interrupted or problem.loss is None:
+            return found
+        scales.append(float(problem.loss.scale))
+        if scales[-1] == 1 or scales[-1] > SETTLED * scales[-2]:
+            return found
+        best, known = found.best, None
+        here, y, radiance = best.y, best.onward, best.linearisation.radiance
 
 
-def _weighed(y: Coordinates, radiance: Predicted, problem: Problem) -> Problem:
-    """``problem`` with the weights of the signal expected at ``y``, and the scale of its loss that of the residuals there."""
-    lit = outermost(light)(y, radiance, problem)
-    return _rescaled(y, radiance, replace(problem, weight=outermost(weights)(problem.batch, lit)))
+def _rescued(run: _Run, best: Point, problem: Problem, starts: int | None, rough: float) -> _Found:
+    """``best``, or what other starts lead to: as many as were asked for, or a few if it has gone astray."""
+    astray = ASTRAY * max(count(problem.batch) - best.y.size, 1)
+    wanted = starts - 1 if starts is not None else OTHERS * (best.chi2 > astray)
+    if not wanted or best.message == INTERRUPTED or len(run.history) >= run.max_steps:
+        return _Found(best, [], problem)
+    points, each = [best], run.max_steps
+    try:
+        for point in islice(_elsewhere(run, problem, rough, wanted * each), wanted):
+            again = _apart(point, min(points, key=lambda other: other.chi2), problem) < APART
+            points.append(point)
+            enough = starts is None and point.converged and (again or point.chi2 < astray)
+            if enough or point.message == INTERRUPTED:
+                break
+    except KeyboardInterrupt:
+        points[0] = best._replace(converged=False, message=INTERRUPTED)
+    run.max_steps = len(run.history) + each
+    first, *rivals = _distinct(points, problem)
+    return _Found(first, rivals, problem, len(points) - 1, best.chi2)
 
 
-def _rescaled(y: Coordinates, radiance: Predicted, problem: Problem) -> Problem:
-    """``problem`` with the scale of its loss, if it has one, that of the residuals at ``y``."""
-    if problem.loss is None:
-        return problem
-    found = scale(np.asarray(outermost(whitened)(y, radiance, problem)), np.asarray(problem.batch.used))
-    return replace(problem, loss=Loss(problem.loss.name, jnp.asarray(found, y.dtype)))
-
-
-def _elsewhere(problem: Problem, search: Callable[..., Point], begin: Begin) -> Iterator[Point]:
-    """Where searches from other starts end, the most promising first."""
-    dtype = problem.start.dtype
+def _elsewhere(run: _Run, problem: Problem, rough: float, steps: int) -> Iterator[Point]:
+    """Where searches from other starts end, the most promising first, in up to so many steps together."""
+    dtype, last = problem.start.dtype, len(run.history) + steps
     for point in ranked(problem):
-        y, start = begin(jnp.asarray(np.append(point, np.zeros(problem.batch.nuisances.offsets)), dtype), problem)
+        x = jnp.asarray(np.append(point, np.zeros(problem.batch.nuisances.offsets)), dtype)
+        y, start = run.begin(x, problem)
         if not np.asarray(start.bad).any():
-            yield search(y, problem, start=start)
+            yield run.search(y, problem, rough, aside=True, steps=last - len(run.history), start=start)
 
 
 def _apart(a: Point, b: Point, problem: Problem) -> float:
@@ -194,6 +264,36 @@ def _distinct(points: Sequence[Point], problem: Problem) -> list[Point]:
     if any(point.message == INTERRUPTED for point in points):
         kept[0] = best._replace(converged=False, message=INTERRUPTED)
     return kept
+
+
+def _final_pass(run: _Run, found: _Found) -> _Found:
+    """The optimum with sigma from the signal that ``found`` expects."""
+    run.final = True
+    before = found.best
+    problem = weighed(before.y, before.linearisation.radiance, found.problem)
+    best = run.search(before.onward, problem, run.tolerance, fallback=before)
+    rivals = found.rivals
+    if best.message != INTERRUPTED:
+        others = [
+            run.search(other.onward, problem, run.tolerance, aside=True, fallback=other) for other in found.rivals
+        ]
+        best, *rivals = _distinct([best, *others], problem)
+    return found._replace(best=best, rivals=rivals, problem=problem)
+
+
+def _refined(run: _Run, found: _Found, finer: Model) -> tuple[_Found, Float[np.ndarray, "n n"]]:
+    """The optimum if the images are explained by ``finer`` there, and the covariance of what that may leave of errors."""
+    best = found.best
+    try:
+        problem = corrected(best.y, best.linearisation.radiance, found.problem, finer)
+        best = run.search(best.onward, problem, run.tolerance)
+    except KeyboardInterrupt:
+        best = found.best._replace(converged=False, message=INTERRUPTED)
+        return found._replace(best=best), np.zeros((best.y.size, best.y.size))
+    deviation = float(model_error.deviation(problem).max())
+    if best.converged and deviation > LARGEST_DEVIATION:
+        best = best._replace(converged=False, message=TOO_COARSE.format(deviation))
+    return found._replace(best=best, problem=problem), model_error.covariance(best, problem)
 
 
 def _shares(best: Point, problem: Problem) -> dict[str, Any]:
@@ -237,30 +337,6 @@ def _check_weights(batch: Batch, names: Sequence[str]) -> None:
             )
 
 
-def restored(
-    observations: Sequence[Observation],
-    parameters: Parameters,
-    y: Coordinates,
-    *,
-    priors: Sequence[Prior],
-    loss: str | None,
-    model: Model,
-    refine: bool,
-) -> tuple[Problem, Linearisation]:
-    """The problem of which ``y`` is the solution, with noise, correction and scale of the loss as they are there."""
-    batch = stack(observations, [float(nm) for nm in parameters.init.wavelengths])
-    problem = pose(batch, parameters, priors, loss, model)
-    problem = replace(problem, shell=outermost(planet_shell)(model, parameters))
-    x, linear = problem.split(y)
-    radiance = evaluated(x, linear, problem).radiance
-    if refine and (finer := model.finer()) is not None:
-        problem = _corrected(y, radiance, problem, finer)
-        assert problem.correction is not None
-        radiance = radiance * problem.correction
-    problem = _weighed(y, radiance, problem)
-    return problem, evaluated(x, linear, problem)
-
-
 def solve(
     observations: Sequence[Observation],
     *,
@@ -289,7 +365,7 @@ def solve(
         raise FitError(f"starts: got {starts}, expected at least 1")
     if not tolerance > 0:
         raise FitError(f"tolerance: got {tolerance}, expected a number > 0")
-    started = time.perf_counter()
+    began = time.perf_counter()
     parameters = select(init, free, tie)
     # A checkpoint that does not belong here is found before anything is computed.
     saved, identity = None, ""
@@ -304,128 +380,42 @@ def solve(
     if count(batch) < size:
         raise FitError(f"{count(batch)} pixels and channels cannot determine {size} parameters; mask less or free less")
     _check_weights(batch, names)
-    problem = pose(batch, parameters, priors, loss, model)
-    unknown = jnp.zeros(batch.nuisances.linear, problem.start.dtype)
-    finer = model.finer() if refine else None
-    compiling = []
-    if batch.mesh is None:
-        # The longest first, at the same time.
-        compiling.append(compile_ahead(linearise, problem.start, unknown, problem))
-        if finer is not None:
-            compiling.append(compile_ahead(model_error.correction, problem.start, problem, batch.measured, finer))
+    problem, finer = pose(batch, parameters, priors, loss, model), model.finer() if refine else None
+    compiling = _compile_ahead(problem, finer)
     problem = replace(problem, shell=outermost(planet_shell)(model, parameters))
     for thread in compiling[:1]:
         thread.join()
-    seconds: list[float] = []
-
-    def evaluate(x: Coordinates, linear: Linear, problem: Problem) -> Linearisation:
-        before = time.perf_counter()
-        result = evaluated(x, linear, problem)
-        seconds.append(time.perf_counter() - before)
-        return result
-
-    def begin(x: Coordinates, problem: Problem) -> tuple[Coordinates, Linearisation]:
-        found = evaluate(x, unknown, problem)
-        linear = jnp.asarray(starting(np.asarray(found.radiance), batch), x.dtype)
-        # Residuals of another exposure are differences of large numbers, and the weights of a robust loss are those of one.
-        if np.any(np.abs(linear) > (0.1 if problem.loss is None else 0)):
-            found = evaluate(x, linear, problem)
-        return jnp.concatenate([x, linear]), found
-
+    run = _Run(tolerance, max_steps, progress, checkpoint, identity)
     if saved is None:
-        y, start = begin(problem.start, problem)
+        y, start = run.begin(problem.start, problem)
     else:
+        run.history += [Step(**row) for row in saved.history]
+        run.final, run.step_size = saved.final, saved.step_size
         y = jnp.asarray(saved.y, problem.start.dtype)
-        start = evaluate(*problem.split(y), problem)
+        start = run.evaluate(*problem.split(y), problem)
     _check_finite(np.asarray(start.bad), names)
-    history = [Step(**row) for row in saved.history] if saved is not None else []
-    final = saved is not None and saved.final
-
-    def keep(y: Coordinates, step_size: float) -> None:
-        nonlocal checkpoint
-        # Of several processes, which all come here with the same, one writes.
-        if checkpoint is not None and jax.process_index() == 0:
-            try:
-                rows = [step._asdict() for step in history]
-                save(checkpoint, identity, Checkpoint(np.asarray(y), step_size, final, rows))
-            except FitError as error:
-                warnings.warn(f"{error}; the fit goes on without a checkpoint", stacklevel=2)
-                checkpoint = None
-
-    search = partial(minimise, evaluate=evaluate, max_steps=max_steps, history=history, progress=progress, keep=keep)
-    # A broken-off fit goes on from the best point, not from one that was only tried.
-    aside = partial(search, keep=lambda *_: None)
-    rough = max(tolerance, FIRST_PASS_TOLERANCE)
-    # A search that goes on has the step size that it had, any other begins with its own.
-    step_size = None if saved is None else saved.step_size
-    radiance, here, scales = start.radiance, y, [math.inf]
-    best: Point | None = None
-    interrupted, tried, first, rivals = False, 0, math.nan, list[Point]()
-    astray = ASTRAY * max(count(batch) - size, 1)
-    while not final:
-        problem = _rescaled(here, radiance, problem)
-        # Rows with the weights of a loss are of no use at another scale of it.
-        known = start if best is None and problem.loss is None else None
-        patience = PATIENCE if starts is None and not tried else None
-        best = search(y, problem, start=known, tolerance=rough, step_size=step_size, patience=patience, fallback=best)
-        step_size = None
-        wanted = 0 if tried else starts - 1 if starts is not None else OTHERS * (best.chi2 > astray)
-        if wanted and best.message != INTERRUPTED and len(history) < max_steps:
-            points, first = [best], best.chi2
-            more = _elsewhere(
-                problem, partial(aside, tolerance=rough, max_steps=len(history) + wanted * max_steps), begin
-            )
-            try:
-                for point in islice(more, wanted):
-                    again = _apart(point, min(points, key=lambda other: other.chi2), problem) < APART
-                    points.append(point)
-                    enough = starts is None and point.converged and (again or point.chi2 < astray)
-                    if enough or point.message == INTERRUPTED:
-                        break
-            except KeyboardInterrupt:
-                points[0] = best._replace(converged=False, message=INTERRUPTED)
-            tried = len(points) - 1
-            best, *rivals = _distinct(points, problem)
-            search, aside = (partial(each, max_steps=len(history) + max_steps) for each in (search, aside))
-        here, y, radiance = best.y, best.onward, best.linearisation.radiance
-        interrupted = best.message == INTERRUPTED
-        if interrupted or problem.loss is None:
-            break
-        # While the fit gets better, fewer pixels pass for outliers.
-        scales.append(float(problem.loss.scale))
-        if scales[-1] == 1 or scales[-1] > SETTLED * scales[-2]:
-            break
-    if not interrupted:
-        final = True
-        problem = _weighed(here, radiance, problem)
-        best = search(y, problem, tolerance=tolerance, step_size=step_size, fallback=best)
-        if best.message != INTERRUPTED:
-            others = [aside(other.onward, problem, tolerance=tolerance, fallback=other) for other in rivals]
-            best, *rivals = _distinct([best, *others], problem)
-    assert best is not None
-    minima = [(point.y, point.chi2) for point in (best, *rivals)] if rivals else []
+    if run.final:
+        problem = weighed(y, start.radiance, problem)
+        found = _Found(run.search(y, problem, tolerance), [], problem)
+    else:
+        found = _first_pass(run, y, start, problem, starts)
+        if not found.interrupted:
+            found = _final_pass(run, found)
+    minima = [(point.y, point.chi2) for point in (found.best, *found.rivals)] if found.rivals else []
     error = np.zeros((size, size))
-    if finer is not None and best.converged:
-        try:
-            for thread in compiling[1:]:
-                thread.join()
-            corrected = _corrected(best.y, best.linearisation.radiance, problem, finer)
-            better = search(best.onward, corrected, tolerance=tolerance)
-            problem, best = corrected, better
-            error = model_error.covariance(best, problem)
-            deviation = float(model_error.deviation(problem).max())
-            if best.converged and deviation > LARGEST_DEVIATION:
-                best = best._replace(converged=False, message=TOO_COARSE.format(deviation))
-        except KeyboardInterrupt:
-            best = best._replace(converged=False, message=INTERRUPTED)
+    if finer is not None and found.best.converged:
+        for thread in compiling[1:]:
+            thread.join()
+        found, error = _refined(run, found, finer)
+    best, problem = found.best, found.problem
     misfit = float(np.sum(best.triangle[:, -1] ** 2)) / max(count(batch) - size, 1)
     if best.converged and misfit > HOPELESS_MISFIT:
         best = best._replace(converged=False, message=UNLIKE.format(math.sqrt(misfit)))
-    if best.converged and first > RIVAL * best.chi2:
-        best = best._replace(message=ELSEWHERE.format(best.message, tried, first / best.chi2))
-    total = time.perf_counter() - started
+    if best.converged and found.given > RIVAL * best.chi2:
+        best = best._replace(message=ELSEWHERE.format(best.message, found.tried, found.given / best.chi2))
+    total = time.perf_counter() - began
     # What a typical evaluation does not explain is compilation and preparation, which happen once.
-    evaluations = min(total, len(seconds) * float(np.median(seconds)))
+    evaluations = min(total, len(run.seconds) * float(np.median(run.seconds)))
     return Solution(
         parameters=parameters,
         batch=batch,
@@ -434,7 +424,7 @@ def solve(
         triangle=best.triangle,
         predicted=np.asarray(outermost(expected)(best.y, best.linearisation.radiance, problem)),
         model_error=error,
-        history=history,
+        history=run.history,
         residual_count=count(batch),
         converged=best.converged,
         message=best.message,
@@ -442,3 +432,15 @@ def solve(
         timings={"compile_s": total - evaluations, "solve_s": evaluations, "total_s": total},
         **_shares(best, problem),
     )
+
+
+def _compile_ahead(problem: Problem, finer: Model | None) -> list[Thread]:
+    """The programs of a fit, compiled at the same time, the longest first. Not those of several devices."""
+    batch = problem.batch
+    if batch.mesh is not None:
+        return []
+    linear = jnp.zeros(batch.nuisances.linear, problem.start.dtype)
+    compiling = [compile_ahead(linearise, problem.start, linear, problem)]
+    if finer is not None:
+        compiling.append(compile_ahead(model_error.correction, problem.start, problem, batch.measured, finer))
+    return compiling

@@ -49,6 +49,7 @@ LEVELS = [
     ["fitting.elimination"],
     ["fitting.starts", "fitting.search"],
     ["fitting.model_error"],
+    ["fitting.evaluation"],
     ["fitting.solve"],
     ["fitting.findings"],
     ["fitting.combinations"],

@@ -9,7 +9,7 @@ from toy_sky import FREE, Toy
 
 from diffatmo.models.base import Ray
 from fitting import FitError, fit
-from fitting.search import distance
+from fitting.search import Step, distance, steps_left
 from fitting.solve import solve
 
 
@@ -323,3 +323,16 @@ def test_numbers_that_single_precision_cannot_square_are_refused(factor, noise):
     )
     with pytest.raises(FitError, match="sun 30: signal and noise: "):
         fit([changed], init=toy_sky.start(), free=["mie_g"], model=Toy())
+
+
+def test_the_steps_that_are_left():
+    """Exact if distances shrink by a constant factor: from 12.5 to 0.1 by halves is seven steps, to 1 four; then two passes."""
+
+    def history(distances, stage):
+        return [Step(n, stage, 1.0, 1.0, True, 0.1, d, 1.0, 1.0) for n, d in enumerate(distances)]
+
+    assert steps_left(history([50, 25, 12.5], stage=3), 0.1) == 7
+    assert steps_left(history([50, 25, 12.5], stage=1), 0.1) == 4 + 4
+    assert steps_left(history([50, 25, 0.05], stage=3), 0.1) == 0
+    assert steps_left(history([50, 60, 70], stage=1), 0.1) is None
+    assert steps_left(history([50, 25], stage=1), 0.1) is None

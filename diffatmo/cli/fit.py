@@ -311,7 +311,8 @@ def run(job: Job, directory: Path, *, overwrite: bool, quiet: bool = False, writ
 
     import fitting
     from fitting import checkpoint, report
-    from fitting.search import INTERRUPTED
+    from fitting.search import INTERRUPTED, steps_left
+    from fitting.solve import TOLERANCE
 
     console = make_console(quiet=quiet)
     file = directory / checkpoint.FILE
@@ -326,9 +327,14 @@ def run(job: Job, directory: Path, *, overwrite: bool, quiet: bool = False, writ
             size = f"{observation.block}×{observation.block}"
             console.print(f"  {observation.name}: {observation.used.sum()} averages of {size} pixels")
 
+    history: list[Step] = []
+
     def show(step: "Step") -> None:
+        history.append(step)
         mark = "" if step.accepted else "  (rejected)"
-        console.print(f"  step {step.step:3}  reduced χ² {step.reduced_chi2:<10.5g}  {step.seconds:.2f} s{mark}")
+        left = steps_left(history, TOLERANCE)
+        time = "" if left is None else f"  about {left * step.seconds:.0f} s left"
+        console.print(f"  step {step.step:3}  reduced χ² {step.reduced_chi2:<10.5g}  {step.seconds:.2f} s{time}{mark}")
 
     def show_point(name: str, value: float, growth: float) -> None:
         console.print(f"  {name} = {value:<10.5g}  Δχ² {growth:.3g}")

@@ -87,7 +87,10 @@ def check_whole(output: Path) -> None:
 def numbers(output: Path) -> np.ndarray:
     found = json.loads((output / "fit.json").read_text())
     assert found["converged"]
-    return np.array([[estimate["value"], estimate["standard_error"]] for estimate in found["parameters"]])
+    spread = [
+        np.ravel([estimate[key]]) for estimate in found["parameters"].values() for key in ("value", "standard_error")
+    ]
+    return np.stack([np.concatenate(spread[::2]), np.concatenate(spread[1::2])], axis=-1)
 
 
 def main() -> None:
