@@ -271,6 +271,9 @@ def test_fit_goes_on_where_it_was_broken_off(tmp_path, s1, start, toy, capfd, mo
     # It was at the optimum already: the steps before, one to be there again, and one of the finer model's pass, if any.
     assert record["converged"]
     assert not (out / checkpoint.FILE).exists()
+    # A process killed after that has left a complete result.
+    assert main([*command, "--resume"]) == 2
+    assert "the fit here is complete" in capfd.readouterr().err
     (out / checkpoint.FILE).write_bytes(kept)
     assert main([*command, "--overwrite"]) == 0
     assert "Going on" not in capfd.readouterr().out

@@ -186,6 +186,10 @@ def check_begun(directory: Path, *, resume: bool, overwrite: bool) -> bool:
         raise InputError(
             f"{file}: a fit was broken off here; give --resume to go on with it, or --overwrite to begin anew"
         )
+    if resume and not file.exists() and (directory / "fit.json").exists():
+        raise InputError(
+            f"{directory}: the fit here is complete, there is nothing to go on with; --overwrite fits again, -o elsewhere"
+        )
     return resume and file.exists()
 
 
