@@ -196,6 +196,9 @@ def visit(
         def of_tile(carry: Any, tile: Tile) -> tuple[Any, Any]:
             directions = tile["directions"]
             light, tangents = _push(lambda view: seen(view, directions), (view,), (of_view,))
+            if tangents is None:
+                # A model that makes no use of what is free.
+                tangents = jnp.zeros((len(seeds) + apart, *light.shape), light.dtype)
             if displaced is not None:
                 _, turns = _push(seen, (view, directions), (displaced, tile["turned"]))
                 tangents = jnp.concatenate([tangents[: len(seeds)], turns, tangents[len(seeds) :]])

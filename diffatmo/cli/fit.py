@@ -337,7 +337,8 @@ def run(job: Job, directory: Path, *, overwrite: bool, quiet: bool = False, writ
         history.append(step)
         mark = "" if step.accepted else "  (rejected)"
         left = steps_left(history, TOLERANCE)
-        time = "" if left is None else f"  about {left * step.seconds:.0f} s left"
+        told = left is not None and left <= job.max_steps - len(history)
+        time = f"  about {(left or 0) * step.seconds:.0f} s left" if told else ""
         console.print(f"  step {step.step:3}  reduced χ² {step.reduced_chi2:<10.5g}  {step.seconds:.2f} s{time}{mark}")
 
     def show_point(name: str, value: float, growth: float) -> None:
