@@ -2,9 +2,10 @@
 
 python tests/benchmarks/coverage.py [FITS] [NAME ...]    (256 of clear by default; hazy is the other)
 
-This is about the statistics, not the physics, so the model makes the images and fits them, without a finer one at the end. Each
-fit sees three small skies with fresh noise of 1 %, the second with an unknown exposure, and starts somewhere else, every number
-some 5 % off: where the search starts does not matter to where it ends, only to how long it takes. An interval of 68.3 % is one standard error to either side of a number, one of 95 % is 1.96.
+This is about the statistics, not the physics, so the model makes the images and fits them, without a finer one at the end.
+Each fit sees three small skies with fresh noise of 1 %, the second with an unknown exposure, and starts somewhere else, every
+number some 5 % off: where the search starts does not matter to where it ends, only to how long it takes. An interval of 68.3 %
+is one standard error to either side of a number, one of 95 % is 1.96.
 """
 
 import sys
