@@ -186,13 +186,21 @@ def shown(name: str, value: float) -> str:
 
 def run(console: Console, mode: str, truths: list[diffatmo.Atmosphere], samples: int) -> None:
     single = Table(
-        "atmosphere", "τ_M 550", "converged", "χ²", "steps", "s", *NAMES.values(), title=f"{mode}: error (pull)"
+        "atmosphere",
+        "τ_M 550",
+        "noise, %",
+        "converged",
+        "χ²",
+        "steps",
+        "s",
+        *NAMES.values(),
+        title=f"{mode}: error (pull)",
     )
     every: list[dict[str, list[Error]]] = []
     silent = []
     for number, truth in enumerate(truths):
         result = recover(truth, number, mode, samples)
-        off = errors(result)
+        off, noise = errors(result), [float(observation.noise.max()) for observation in result.observations]
         every.append(off)
         worst = {name: max(bands, key=lambda e: abs(e.off)) for name, bands in off.items()}
         pulls = [e.pull for bands in off.values() for e in bands]
@@ -201,6 +209,7 @@ def run(console: Console, mode: str, truths: list[diffatmo.Atmosphere], samples:
         row = [
             f"{number}{' (other planet)' if number == OTHER_PLANET else ''}",
             f"{float(truth.mie_optical_depth[1]):.3f}",
+            "–".join(f"{100 * limit:.1f}" for limit in (min(noise), max(noise))),
             "yes" if result.converged else "NO",
             f"{result.reduced_chi2:.3f}",
             str(result.iterations),
@@ -212,7 +221,7 @@ def run(console: Console, mode: str, truths: list[diffatmo.Atmosphere], samples:
     console.print(single)
     table = Table(
         "number", "median error", "asked", "median error bar", "within 1 s.e.", "within 2 s.e.", "largest pull", "no bar",
-        title=f"{mode}: {len(truths)} atmospheres",
+        title=f"{mode}: of {len(truths)} atmospheres",
     )  # fmt: skip
     pulls = {name: np.array([e.pull for off in every for e in off[name]]) for name in ASKED}
     for name, asked in ASKED.items():
