@@ -1,5 +1,6 @@
-"""The sun: its direction, the radiance of its disc, and where it is in a picture that shows it."""
+"""The sun: its direction, also from time and place, the radiance of its disc, and where it is in a picture that shows it."""
 
+from datetime import datetime
 from functools import partial
 from typing import NamedTuple, Protocol
 
@@ -8,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from diffatmo import ephemeris
 from diffatmo._types import Direction, Radiance, Scalar, Spectrum
 from diffatmo.constants import SUN_ANGULAR_RADIUS
 from diffatmo.numerics import safe_norm, safe_sqrt
@@ -32,6 +34,48 @@ def angles(direction: Direction) -> tuple[Float[Array, "..."], Float[Array, "...
     vertical = (east == 0) & (north == 0)
     azimuth = jnp.arctan2(east, jnp.where(vertical, 1, north))
     return jnp.arctan2(safe_norm(direction[..., :2]), direction[..., 2]), jnp.mod(azimuth, 2 * np.pi)
+
+
+def position(
+    time: datetime,
+    *,
+    latitude_deg: float | Float[Array, "..."],
+    longitude_deg: float | Float[Array, "..."],
+    altitude_km: float | Float[Array, "..."] = 0.0,
+    pressure_hpa: float | Float[Array, "..."] | None = None,
+    temperature_k: float | Float[Array, "..."] = 288.15,
+    offset_s: float | Float[Array, "..."] = 0.0,
+    refraction: bool = True,
+) -> Direction:
+    """Unit vector to the sun at a time and a place (north and east positive), to 0.005° from 1950 to 2100.
+
+    ``time`` needs a time zone; it is reckoned on the host. All else may be arrays, and be differentiated by:
+    ``offset_s`` are seconds to be added to ``time``, of a clock that is off or over a day (in single precision a few days
+    at most). Refraction is that of the pressure and temperature at the place, of a pressure that falls off with altitude
+    unless it is given, and fades below the horizon. Raises :class:`diffatmo.ephemeris.TimeError`.
+    """
+    if pressure_hpa is None:
+        pressure_hpa = 1013.25 * jnp.exp(-_array(altitude_km) / 8)
+    strength = _array(pressure_hpa) / 1010 * (283.15 / _array(temperature_k))
+    place = (_array(value) for value in (latitude_deg, longitude_deg, altitude_km, offset_s))
+    return _position(ephemeris.epoch(time), *place, strength if refraction else None)
+
+
+@jax.jit
+def _position(
+    epoch: ephemeris.Epoch, latitude: Array, longitude: Array, altitude: Array, offset: Array, strength: Array | None
+) -> Direction:
+    towards = ephemeris.topocentric(
+        ephemeris.geocentric(epoch, offset),
+        latitude=jnp.radians(latitude),
+        longitude=jnp.radians(longitude),
+        altitude=altitude,
+    )
+    return towards if strength is None else ephemeris.refracted(towards, strength=strength)
+
+
+def _array(value: float | Float[Array, "..."]) -> Array:
+    return jnp.asarray(value, jnp.result_type(float))
 
 
 def limb_exponent(wavelengths: Spectrum) -> Spectrum:

@@ -19,6 +19,7 @@ ROOT = Path(__file__).parent.parent
 LEVELS = [
     ["diffatmo._types", "diffatmo.constants", "diffatmo.compiling", "diffatmo.folders"],
     ["diffatmo.numerics"],
+    ["diffatmo.ephemeris"],
     [f"diffatmo.{name}" for name in ("geometry", "phase", "table", "spectrum", "color", "codecs", "camera", "sun")],
     ["diffatmo.rays", "diffatmo.atmosphere"],
     ["diffatmo.transmittance"],
