@@ -99,6 +99,8 @@ def files(tmp_path_factory):
         "starts.scene": 'starts = 0\n[[image]]\nfile = "good.exr"\n',
         "profile.scene": 'profile = ["mie_h"]\n[[image]]\nfile = "good.exr"\n',
         "sun_twice.scene": '[[image]]\nfile = "good.exr"\nsun = "detect"\nsun_zenith_deg = 40\n',
+        "time.scene": '[[image]]\nfile = "good.exr"\ntime = 2024-06-21T12:00:00\n',
+        "time_alone.scene": '[[image]]\nfile = "good.exr"\ntime = 2024-06-21T12:00:00Z\nlatitude_deg = 48\n',
         "sun_word.scene": '[[image]]\nfile = "good.exr"\nsun = "find"\n',
         "loss.scene": 'loss = "l1"\n[[image]]\nfile = "good.exr"\n',
         "prior_text.scene": 'prior = "molecular"\n[[image]]\nfile = "good.exr"\n',
@@ -121,6 +123,7 @@ def files(tmp_path_factory):
 
 
 PLACE = ["--altitude-km", "0.1", "--sun-zenith-deg", "40", "--sun-azimuth-deg", "0"]
+HERE = ["--time", "2024-06-21T12:00:00+02:00", "--latitude-deg", "48", "--longitude-deg", "11"]
 PANORAMA = ["--projection", "equirectangular", *PLACE]
 
 # Arguments, and what the message has to mention. Names in capitals are files of the fixture.
@@ -218,6 +221,19 @@ CASES = {
     ),
     "tie of no kind": (["fit", "GOOD.exr", "--free", "mie_g", "--tie", "mie_scattering"], "--tie"),
     "sun given twice": (["fit", "GOOD.exr", "--sun", "detect", "--sun-zenith-deg", "40"], "contradicts"),
+    "time without an offset": (
+        ["fit", "GOOD.exr", "--time", "2024-06-21T12:00:00"],
+        "--time: got '2024-06-21T12:00:00', expected a date and time with its offset from UTC",
+    ),
+    "time in words": (["render", "GOOD.toml", "-o", "new.exr", "--time", "noon"], "--time: got 'noon'"),
+    "time without a place": (["fit", "GOOD.exr", "--time", "2024-06-21T12:00:00Z"], "latitude_deg: missing"),
+    "place without a time": (
+        ["render", "GOOD.toml", "-o", "new.exr", "--latitude-deg", "48", "--longitude-deg", "11"],
+        "time: missing",
+    ),
+    "time and angles": (["fit", "GOOD.exr", *HERE, "--sun-azimuth-deg", "3"], "time contradicts sun_azimuth_deg"),
+    "time and detection": (["fit", "GOOD.exr", *HERE, "--sun", "detect"], '"detect" contradicts time'),
+    "at night": (["fit", "GOOD.exr", *HERE[:3], "0", "--longitude-deg", "-150"], "degrees below the horizon"),
     "image and scene": (["fit", "GOOD.exr", "--config", "NOISE.scene"], "contradict"),
     "option without image": (["fit", "--noise", "0.1"], "--noise"),
     "option beside a scene": (["fit", "--config", "NOISE.scene", "--altitude-km", "1"], "--altitude-km"),
@@ -249,6 +265,11 @@ CASES = {
     "no steps in a scene": (["fit", "--config", "STEPS.scene"], "max_steps"),
     "no starts in a scene": (["fit", "--config", "STARTS.scene"], "starts: got 0"),
     "profile of no number": (["fit", "--config", "PROFILE.scene"], "did you mean mie_g"),
+    "time without an offset in a scene": (
+        ["fit", "--config", "TIME.scene"],
+        "image 1: time: got 2024-06-21 12:00:00, expected a date and time with its offset from UTC",
+    ),
+    "time without a place in a scene": (["fit", "--config", "TIME_ALONE.scene"], "longitude_deg: missing"),
     "contradiction in a scene": (["fit", "--config", "SUN_TWICE.scene"], "contradicts"),
     "unknown word in a scene": (["fit", "--config", "SUN_WORD.scene"], "detect"),
     "unknown loss": (["fit", "--config", "LOSS.scene"], "loss"),

@@ -6,6 +6,7 @@ import math
 import os
 import subprocess
 import sys
+from datetime import datetime
 from pathlib import Path
 
 import jax
@@ -15,7 +16,7 @@ import pytest
 
 from diffatmo import atmosphere, imageio, models, scene, sun
 from diffatmo.camera import Equirectangular, Fisheye, Pinhole
-from diffatmo.cli import cache, shipped
+from diffatmo.cli import cache, images, shipped
 from diffatmo.cli import radiance as radiance_command
 from diffatmo.cli.main import main
 from diffatmo.cli.render import picture_size
@@ -340,6 +341,24 @@ def test_options_come_before_the_header(tmp_path, s1, start, toy):
     assert record["altitude_km"] == 3
     assert record["sun_zenith_deg"] == pytest.approx(50, abs=1e-3)
     assert record["sun_azimuth_deg"] == pytest.approx(math.degrees(0.3), abs=1e-3)  # of the header
+
+
+def test_the_sun_is_found_from_time_and_place(tmp_path, s1, start, toy):
+    place = {"latitude_deg": 48.0, "longitude_deg": 11.5, "altitude_km": 0.5}
+    expected = np.asarray(sun.position(datetime.fromisoformat("2024-06-21T10:00:00Z"), **place))
+    (tmp_path / "scene.toml").write_text(
+        '[[image]]\nfile = "sky.exr"\ntime = 2024-06-21T12:00:00+02:00\nlatitude_deg = 48\nlongitude_deg = 11.5\n'
+        "altitude_km = 0.5\n"
+    )
+    toy_image(tmp_path / "sky.exr", s1, zenith=40)
+    (seen,) = read_scene(tmp_path / "scene.toml").images
+    found = images.observe(seen, "sky", atmosphere.load(start)).observation
+    np.testing.assert_allclose(found.sun, expected, atol=1e-6)
+
+    said = ["--time", "2024-06-21T12:00:00+02:00", "--latitude-deg", "48", "--longitude-deg", "11.5"]
+    again = [start, "-o", str(tmp_path / "new.exr"), "--width", "16", "--altitude-km", "0.5"]
+    assert main(["render", *again, *said]) == 0
+    np.testing.assert_allclose(scene.load(tmp_path / "new.exr").scene.sun, expected, atol=1e-6)
 
 
 def test_channels_are_matched_by_wavelength(tmp_path, s1, start, toy):

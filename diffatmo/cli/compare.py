@@ -90,7 +90,7 @@ def compare(
     the sheet of all of them as PNG and in an HTML page, and the table as JSON. Relative errors are weighted by solid angle,
     over all wavelengths, more than 3° from the sun; times are those of this machine.
     """
-    given = CENTRED | keys.given(CAMERA_KEYS | PLACE_KEYS, values)
+    given = CENTRED | keys.with_sun(keys.given(CAMERA_KEYS | PLACE_KEYS, values))
     keys.check_camera_options(given)
     names = list(dict.fromkeys([truth, *models]))
     air = read_atmosphere(atmosphere)

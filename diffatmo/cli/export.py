@@ -70,7 +70,7 @@ def export(
     of_tables = {k: v for k, v in {"parameterisation": parameterisation, "orders": orders}.items() if v is not None}
     for name in of_camera if luts == "bruneton" else of_tables:
         raise InputError(f"{keys.flag_of(name)} contradicts --luts {luts}: it belongs to the other one")
-    options = VIEWED | of_place
+    options = VIEWED | keys.with_sun(of_place)
     keys.check_camera_options(options)
     air = read_atmosphere(atmosphere)
     folders.prepare(output, names=FOLDERS, overwrite=overwrite)

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from diffatmo.cli.common import InputError
-from diffatmo.cli.keys import CAMERA_KEYS, flag_of, make_camera
-from diffatmo.cli.scenefile import ImageSpec
+from diffatmo.cli.keys import CAMERA_KEYS, flag_of, make_camera, with_sun
+from diffatmo.cli.scenefile import LOWEST_SUN_DEG, ImageSpec
 
 if TYPE_CHECKING:
     import numpy as np
@@ -70,7 +70,7 @@ def observe(spec: ImageSpec, name: str, init: "Atmosphere") -> Seen:
     shot = scene.from_image(spec.file, image) if scene.ATTRIBUTE in image.metadata else None
     try:
         pixels = in_order(image, init)
-        camera = find_camera(options, pixels, shot)
+        camera, altitude = find_camera(options, pixels, shot), find_altitude(options, shot)
         chosen: dict[str, Any] = {key: options[key] for key in NUMBERS_AND_NAMES if key in options}
         chosen |= {key.removesuffix("_deg"): math.radians(options[key]) for key in ANGLES if key in options}
         notes = shot.notes if shot else {}
@@ -78,8 +78,8 @@ def observe(spec: ImageSpec, name: str, init: "Atmosphere") -> Seen:
         observation = fitting.observe(
             pixels,
             camera=camera,
-            altitude=find_altitude(options, shot),
-            sun=find_sun(options, pixels, camera, shot),
+            altitude=altitude,
+            sun=find_sun({**options, "altitude_km": altitude}, pixels, camera, shot),
             mask=read_mask(Path(options["mask"])) if "mask" in options else None,
             exposure_value=float(shot.scene.exposure) if shot else 1.0,
             name=name,
@@ -168,6 +168,11 @@ def find_sun(options: Mapping[str, Any], pixels: "np.ndarray", camera: "Camera",
 
     if "sun" in options:
         return sun.find(pixels, camera).direction
+    if "time" in options:
+        options = with_sun(options)
+        if options["sun_zenith_deg"] > LOWEST_SUN_DEG:
+            below = options["sun_zenith_deg"] - 90
+            raise InputError(f"time: the sun is {below:.1f} degrees below the horizon then, expected at most 18")
     keys = ("sun_zenith_deg", "sun_azimuth_deg")
     known: dict[str, float] = {}
     if shot:

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from datetime import datetime
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -73,7 +74,23 @@ class Flag:
         return value
 
 
-Key = Number | Word | Flag
+@dataclass(frozen=True)
+class Moment:
+    """A key whose value is a date and time with its offset from UTC, of a TOML file or as text."""
+
+    help: str
+    expected: str = "a date and time with its offset from UTC, like 2024-06-21T12:00:00+02:00"
+
+    def read(self, value: Any) -> datetime:
+        """The value, or :class:`ValueError`."""
+        if isinstance(value, str):
+            value = datetime.fromisoformat(value)
+        if not isinstance(value, datetime) or value.utcoffset() is None:
+            raise ValueError
+        return value
+
+
+Key = Number | Word | Flag | Moment
 
 CAMERA_KEYS: dict[str, Key] = {
     "projection": Word("How pixels map to directions.", ("equirectangular", "fisheye", "pinhole")),
@@ -89,6 +106,9 @@ PLACE_KEYS: dict[str, Key] = {
     "altitude_km": Number("Height of the camera above the ground.", 0),
     "sun_zenith_deg": Number("Zenith angle of the sun; above 90 it is below the horizon.", 0, 180),
     "sun_azimuth_deg": Number("Azimuth of the sun, clockwise from north."),
+    "time": Moment("Instead, with a latitude and a longitude: when it is, like 2024-06-21T12:00:00+02:00."),
+    "latitude_deg": Number("Where it is, north positive.", -90, 90),
+    "longitude_deg": Number("Where it is, east positive.", -180, 180),
 }
 """Where the camera and the sun are."""
 
@@ -98,7 +118,8 @@ def read(key: Key, name: str, value: Any) -> Any:
     try:
         return key.read(value)
     except ValueError as error:
-        raise InputError(f"{name}: got {value!r}, expected {key.expected}") from error
+        shown = value if isinstance(value, datetime) else repr(value)
+        raise InputError(f"{name}: got {shown}, expected {key.expected}") from error
 
 
 def options(keys: Mapping[str, Key], shown: Mapping[str, Any] | None = None) -> Callable[[Any], Any]:
@@ -116,6 +137,8 @@ def options(keys: Mapping[str, Key], shown: Mapping[str, Any] | None = None) -> 
                 flag += f"/--no-{name.replace('_', '-')}"
             elif isinstance(key, Number):
                 kind, metavar = click.FLOAT, "NUMBER"
+            elif isinstance(key, Moment):
+                metavar = "TIME"
             elif key.choices:
                 kind = click.Choice(key.choices)
             command = click.option(flag, name, type=kind, metavar=metavar, default=None, help=key.help + default)(
@@ -145,6 +168,35 @@ def check_camera_options(options: Mapping[str, Any]) -> None:
         raise InputError("fov_deg contradicts projection equirectangular, which shows the whole sphere or half of it")
     if projection == "pinhole" and options.get("fov_deg", 0) >= 180:
         raise InputError(f"fov_deg: got {options['fov_deg']:g}, expected less than 180 for projection pinhole")
+
+
+def check_sun_options(options: Mapping[str, Any]) -> None:
+    """Refuse a place of the sun that contradicts itself or is said in part."""
+    found_by = ("time", "latitude_deg", "longitude_deg")
+    said = [key for key in found_by if key in options]
+    angles = [key for key in ("sun_zenith_deg", "sun_azimuth_deg") if key in options]
+    if "sun" in options and (angles or said):
+        raise InputError(f'sun = "detect" contradicts {" and ".join(angles + said)}: give one or the other')
+    if angles and said:
+        raise InputError(f"{said[0]} contradicts {angles[0]}: the sun is found from {', '.join(found_by)}, or given")
+    missing = [key for key in found_by if key not in options]
+    if said and missing:
+        raise InputError(f"{missing[0]}: missing, the sun is found from {', '.join(found_by)} together")
+
+
+def with_sun(options: Mapping[str, Any]) -> dict[str, Any]:
+    """``options`` with the angles of the sun in place of time, latitude and longitude, if those are given."""
+    check_sun_options(options)
+    if "time" not in options:
+        return dict(options)
+    import numpy as np
+
+    from diffatmo import sun
+
+    place = {key: options[key] for key in ("latitude_deg", "longitude_deg", "altitude_km") if key in options}
+    zenith, azimuth = np.degrees(sun.angles(sun.position(options["time"], **place))).tolist()
+    others = {key: value for key, value in options.items() if key not in ("time", "latitude_deg", "longitude_deg")}
+    return others | {"sun_zenith_deg": zenith, "sun_azimuth_deg": azimuth}
 
 
 def make_camera(description: Mapping[str, Any], *, height: int, width: int) -> "Camera":

@@ -70,7 +70,7 @@ def render(
     header, everything that it was made from; a PNG is developed for the screen.
     """
     given = keys.given(CAMERA_KEYS | PLACE_KEYS | EXPOSURE, values)
-    options: dict[str, Any] = DEFAULTS | given
+    options: dict[str, Any] = DEFAULTS | keys.with_sun(given)
     keys.check_camera_options(options)
     writers = [(path, _writer(path)) for path in outputs]
     for path in outputs:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from diffatmo.cli.common import InputError
-from diffatmo.cli.keys import CAMERA_KEYS, PLACE_KEYS, Key, Number, Word, check_camera_options, read
+from diffatmo.cli.keys import CAMERA_KEYS, PLACE_KEYS, Key, Number, Word, check_camera_options, check_sun_options, read
 
 FREE = (
     "rayleigh_scattering",
@@ -22,11 +22,13 @@ FREE = (
 )
 """Parameters that are free unless the user says otherwise."""
 
+LOWEST_SUN_DEG = 108
+"""Zenith angle of the lowest sun whose sky is fitted."""
 
 IMAGE_KEYS: dict[str, Key] = {
     **CAMERA_KEYS,
     **PLACE_KEYS,
-    "sun_zenith_deg": Number("Zenith angle of the sun; above 90 it is below the horizon.", 0, 108),
+    "sun_zenith_deg": Number("Zenith angle of the sun; above 90 it is below the horizon.", 0, LOWEST_SUN_DEG),
     "sun": Word("Find the sun in the picture.", ("detect",)),
     "exposure": Word(
         "fixed, free, free-per-channel, or the name of a group of images that share one.  [default: fixed]"
@@ -125,8 +127,7 @@ class FitSpec:
 
 def check_image_options(options: Mapping[str, Any]) -> None:
     """Refuse options of one image that contradict each other."""
-    if "sun" in options and ("sun_zenith_deg" in options or "sun_azimuth_deg" in options):
-        raise InputError('sun = "detect" contradicts sun_zenith_deg and sun_azimuth_deg: give one or the other')
+    check_sun_options(options)
     check_camera_options(options)
 
 
