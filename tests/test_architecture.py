@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import diffatmo
-from diffatmo.cli import common, export, scenefile
+from diffatmo.cli import common, export, keys, scenefile
 
 ROOT = Path(__file__).parent.parent
 
@@ -137,13 +137,14 @@ def test_public_names_resolve():
 
 
 def test_model_names_of_the_command_line():
-    from diffatmo import models
+    from diffatmo import camera, models
     from diffatmo.models import tables
     from fitting import robust
 
     assert tuple(models.MODELS) == common.MODELS
     assert set(scenefile.MODELS) == set(models.MODELS) - {"pathtrace"}
     assert robust.LOSSES == scenefile.LOSSES
+    assert tuple(camera.MAPPINGS) == keys.MAPPINGS
     assert export.PARAMETERISATIONS == tables.PARAMETERISATIONS
 
 

@@ -101,6 +101,7 @@ def files(tmp_path_factory):
         "sun_twice.scene": '[[image]]\nfile = "good.exr"\nsun = "detect"\nsun_zenith_deg = 40\n',
         "time.scene": '[[image]]\nfile = "good.exr"\ntime = 2024-06-21T12:00:00\n',
         "time_alone.scene": '[[image]]\nfile = "good.exr"\ntime = 2024-06-21T12:00:00Z\nlatitude_deg = 48\n',
+        "distortion.scene": '[[image]]\nfile = "good.exr"\ndistortion = 0.1\n',
         "sun_word.scene": '[[image]]\nfile = "good.exr"\nsun = "find"\n',
         "loss.scene": 'loss = "l1"\n[[image]]\nfile = "good.exr"\n',
         "prior_text.scene": 'prior = "molecular"\n[[image]]\nfile = "good.exr"\n',
@@ -124,6 +125,7 @@ def files(tmp_path_factory):
 
 PLACE = ["--altitude-km", "0.1", "--sun-zenith-deg", "40", "--sun-azimuth-deg", "0"]
 HERE = ["--time", "2024-06-21T12:00:00+02:00", "--latitude-deg", "48", "--longitude-deg", "11"]
+WIDE = ["--mapping", "orthographic", "--fov-deg", "200"]
 PANORAMA = ["--projection", "equirectangular", *PLACE]
 
 # Arguments, and what the message has to mention. Names in capitals are files of the fixture.
@@ -176,6 +178,22 @@ CASES = {
     "field of view of nothing": (
         ["fit", "GOOD.exr", "--projection", "fisheye", "--fov-deg", "1e-30"],
         "--fov-deg: got 1e-30, expected a number from 0.01 to 360",
+    ),
+    "mapping of a pinhole": (
+        ["render", "GOOD.toml", "-o", "new.exr", "--projection", "pinhole", "--mapping", "equisolid"],
+        "mapping: unknown key; a camera with pinhole projection has",
+    ),
+    "no distortion": (
+        ["render", "GOOD.toml", "-o", "new.exr", "--projection", "pinhole", "--distortion", "much"],
+        "--distortion: got 'much', expected numbers, like",
+    ),
+    "folding distortion": (
+        ["render", "GOOD.toml", "-o", "new.exr", "--projection", "pinhole", "--distortion", "-2"],
+        "folds the picture",
+    ),
+    "more than orthographic": (
+        [*("render", "GOOD.toml", "-o", "new.exr", "--projection", "fisheye"), *WIDE],
+        "fov: got 200 degrees",
     ),
     "no pixels": (["render", "GOOD.toml", "-o", "new.exr", "--width", "0"], "--width"),
     "altitude below ground": (["render", "GOOD.toml", "-o", "new.exr", "--altitude-km", "-1"], "--altitude-km"),
@@ -270,6 +288,7 @@ CASES = {
         "image 1: time: got 2024-06-21 12:00:00, expected a date and time with its offset from UTC",
     ),
     "time without a place in a scene": (["fit", "--config", "TIME_ALONE.scene"], "longitude_deg: missing"),
+    "distortion that is no list": (["fit", "--config", "DISTORTION.scene"], "distortion: got 0.1, expected numbers"),
     "contradiction in a scene": (["fit", "--config", "SUN_TWICE.scene"], "contradicts"),
     "unknown word in a scene": (["fit", "--config", "SUN_WORD.scene"], "detect"),
     "unknown loss": (["fit", "--config", "LOSS.scene"], "loss"),

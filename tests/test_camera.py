@@ -1,5 +1,7 @@
 """Cameras: round trips, known directions, solid angles, derivatives."""
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -10,13 +12,21 @@ from diffatmo import camera
 from diffatmo.camera import CameraError, Equirectangular, Fisheye, Pinhole
 
 POSE = {"yaw": 0.7, "pitch": 0.4, "roll": -0.3}
+BROWN = [-0.21, 0.09, -0.02, 1.5e-3, -8e-4]
+KANNALA = [0.02, -0.012, 0.003, -3e-4]
 CAMERAS = {
     "equirectangular": lambda: Equirectangular(12, 24),
     "equirectangular tilted": lambda: Equirectangular(12, 24, **POSE),
     "equirectangular upper": lambda: Equirectangular(6, 24, upper=True),
     "fisheye": lambda: Fisheye(15, 15),
     "fisheye wide": lambda: Fisheye(14, 21, fov=np.radians(220.0), **POSE),
+    "equisolid": lambda: Fisheye(15, 15, fov=np.radians(200.0), mapping="equisolid"),
+    "stereographic": lambda: Fisheye(15, 15, mapping="stereographic", circle=0.9, **POSE),
+    "orthographic": lambda: Fisheye(15, 15, fov=np.radians(160.0), mapping="orthographic", **POSE),
+    "fisheye cut": lambda: Fisheye(14, 21, fov=np.radians(170.0), mapping="equisolid", circle=1.3, **POSE),
+    "fisheye distorted": lambda: Fisheye(15, 15, fov=np.radians(190.0), distortion=KANNALA, **POSE),
     "pinhole": lambda: Pinhole(9, 16),
+    "pinhole distorted": lambda: Pinhole(9, 16, fov_y=np.radians(50.0), distortion=BROWN, **POSE),
     "pinhole tilted": lambda: Pinhole(9, 16, fov_y=np.radians(75.0), **POSE),
 }
 
@@ -150,6 +160,146 @@ def test_no_nan_at_special_directions(kind):
     assert np.isfinite(jax.jit(jax.jacfwd(lambda xy: lens.directions_at(*xy)))(jnp.array([2.0, 2.0]))).all()
 
 
+LENSES = {
+    **{mapping: lambda mapping=mapping: Fisheye(5, 7, fov=2.6, mapping=mapping) for mapping in camera.MAPPINGS},
+    "cut": lambda: Fisheye(5, 7, fov=2.6, mapping="stereographic", circle=1.4, **POSE),
+    "distorted": lambda: Fisheye(5, 7, fov=3.2, mapping="equidistant", distortion=KANNALA, **POSE),
+    "distorted equisolid": lambda: Fisheye(5, 7, fov=3.0, mapping="equisolid", distortion=[0.05], circle=0.9),
+    "pinhole": lambda: Pinhole(5, 7, fov_y=1.0),
+    "pinhole barrel": lambda: Pinhole(5, 7, fov_y=1.0, distortion=BROWN, **POSE),
+    "pinhole pincushion": lambda: Pinhole(5, 7, fov_y=1.0, distortion=[0.15, 0.03], **POSE),
+}
+
+
+@pytest.fixture(params=LENSES)
+def lens(request, x64):
+    return LENSES[request.param]()
+
+
+def rim(lens):
+    """Points (x, y): the axis, inside, at the edge of the picture or just inside of the circle."""
+    centre = np.array([(lens.width - 1) / 2, (lens.height - 1) / 2])
+    reach = np.array([lens.width, lens.height]) / 2
+    if isinstance(lens, Fisheye):
+        reach = np.minimum(reach, 0.9999 * min(reach) * float(lens.circle) / np.sqrt(2))
+    steps = np.array([[0, 0], [0.3, -0.4], [1, 1], [-1, 1], [1, -1], [0.6, 0]])
+    return jnp.asarray(centre + steps * reach)
+
+
+def test_lenses_invert_exactly_and_to_second_order(lens):
+    def there_and_back(parameters, xy):
+        inner = eqx.tree_at(leaves, lens, parameters)
+        return inner.pixels(inner.directions_at(xy[0], xy[1]))
+
+    def leaves(inner):
+        names = [name for name in ("fov", "fov_y", "circle", "yaw", "pitch", "roll") if hasattr(inner, name)]
+        return [getattr(inner, name) for name in names] + [inner.distortion] * bool(lens.distortion.size)
+
+    # Compiled once per lens.
+    @jax.jit
+    @functools.partial(jax.vmap, in_axes=(None, 0))
+    def derivatives(parameters, xy):
+        first = jax.jacfwd(there_and_back, argnums=(0, 1))
+        second = jax.jacfwd(jax.jacfwd(lambda xy: there_and_back(parameters, xy)))
+        return there_and_back(parameters, xy), *first(parameters, xy), second(xy)
+
+    points = rim(lens)
+    again, by_parameters, by_point, twice = derivatives(leaves(lens), points)
+    np.testing.assert_allclose(again, points, atol=1e-9)
+    np.testing.assert_allclose(by_point, np.broadcast_to(np.eye(2), by_point.shape), atol=1e-6)
+    for slope in by_parameters:
+        np.testing.assert_allclose(slope, 0, atol=1e-6)
+    # Off the axis, where a distance has no second derivative.
+    np.testing.assert_allclose(twice[1:], 0, atol=1e-6)
+
+
+def test_lenses_differentiate_in_all_they_have(lens, check_jacobian):
+    points = rim(lens)
+    towards = lens.directions_at(points[:, 0], points[:, 1])
+    names = [name for name in ("fov", "fov_y", "circle", "yaw", "pitch", "roll") if hasattr(lens, name)]
+    start = np.array([float(getattr(lens, name)) for name in names] + lens.distortion.tolist() + [1.0])
+
+    def seen(values, points, towards):
+        own = {"distortion": values[len(names) : -1], **dict(zip(names, values[: len(names)], strict=True))}
+        own |= {"mapping": lens.mapping} if isinstance(lens, Fisheye) else {}
+        other = type(lens)(lens.height, lens.width, **own).zoomed(values[-1])
+        return jnp.concatenate([other.directions_at(points[:, 0], points[:, 1]).ravel(), other.pixels(towards).ravel()])
+
+    check_jacobian(seen, [start], points, towards)
+
+
+def test_solid_angles_are_what_pixels_cover(lens):
+    x, y = jnp.meshgrid(jnp.arange(lens.width) * 1.0, jnp.arange(lens.height) * 1.0)
+
+    @jax.jit
+    @jax.vmap
+    def by_area(xy):
+        derivative = jax.jacfwd(lambda xy: lens.directions_at(xy[0], xy[1]))(xy)
+        return jnp.linalg.norm(jnp.cross(derivative[:, 0], derivative[:, 1]))
+
+    area = by_area(jnp.stack([x, y], -1).reshape(-1, 2)).reshape(x.shape)
+    valid = np.asarray(lens.valid())
+    np.testing.assert_allclose(lens.solid_angles()[valid], area[valid], rtol=1e-9)
+
+
+def test_a_longer_focal_length_magnifies_every_lens(lens):
+    points = rim(lens)
+    centre = np.array([(lens.width - 1) / 2, (lens.height - 1) / 2])
+    # Down to a smaller picture: what is outside of one is continued in another way.
+    near = lens.zoomed(0.9).pixels(lens.directions_at(points[:, 0], points[:, 1]))
+    np.testing.assert_allclose(near - centre, 0.9 * (points - centre), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("mapping", "share"),
+    [
+        ("equidistant", 2 / 3),
+        ("equisolid", np.sin(np.pi / 6) / np.sin(np.pi / 4)),
+        ("stereographic", np.tan(np.pi / 6)),
+        ("orthographic", np.sin(np.pi / 3)),
+    ],
+)
+def test_mappings_at_sixty_degrees(mapping, share):
+    lens = Fisheye(101, 101, mapping=mapping)
+    north = jnp.array([0.0, np.sin(np.pi / 3), np.cos(np.pi / 3)])
+    np.testing.assert_allclose(lens.pixels(north), [50, 50 - 50.5 * share], atol=1e-4)
+    # What is below the horizon is outside, also right behind.
+    below = jnp.array([[0.0, 0.0, -1.0], [0.0, 0.6, -0.8], [0.6, -0.79, -0.1]])
+    assert not np.any(lens.sees(below))
+
+
+def test_distortions_are_the_published_polynomials(x64):
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(-0.5, 0.5, (2, 50))
+    k1, k2, k3, p1, p2 = BROWN
+    r2 = x * x + y * y
+    radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+    shown = [
+        x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+        y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+    ]
+    lens = Pinhole(100, 100, fov_y=np.radians(60.0), distortion=BROWN)
+    towards = np.stack([x, np.ones_like(x), -y], -1) / np.sqrt(1 + r2)[:, None]
+    focal = 50 / np.tan(np.radians(30))
+    np.testing.assert_allclose(lens.pixels(jnp.asarray(towards)), 49.5 + focal * np.stack(shown, -1), atol=1e-9)
+
+    angle = np.linspace(0, np.radians(85), 20)
+    polynomial = np.polynomial.polynomial.polyval(angle**2, [1, *KANNALA]) * angle
+    lens = Fisheye(100, 100, fov=np.radians(170.0), distortion=KANNALA)
+    north = np.stack([0 * angle, np.sin(angle), np.cos(angle)], -1)
+    np.testing.assert_allclose(
+        49.5 - lens.pixels(jnp.asarray(north))[:, 1], 50 * polynomial / polynomial[-1], atol=1e-9
+    )
+
+
+def test_what_is_far_outside_is_not_folded_into_the_picture():
+    lens = Pinhole(60, 80, fov_y=np.radians(50.0), distortion=[-0.25, 0.04])
+    angle = np.radians(np.linspace(0, 89.9, 200))
+    x, _ = np.moveaxis(np.asarray(lens.pixels(np.stack([np.sin(angle), np.cos(angle), 0 * angle], -1))), -1, 0)
+    assert np.all(np.diff(x) > 0)
+    assert not bool(lens.sees(jnp.array([0.95, 0.3122499, 0.0])))
+
+
 def test_vmap_over_poses_and_jit():
     yaws = jnp.linspace(0.0, 1.0, 4)
     fast = jax.jit(jax.vmap(lambda yaw: Pinhole(4, 6, yaw=yaw).directions()))(yaws)
@@ -186,6 +336,22 @@ def test_dict_is_readable():
         (lambda: Pinhole(5, 5, fov_y=np.pi), "fov_y: got 180 degrees, expected more than 0 and at most 179"),
         (lambda: Fisheye(5, 5, fov=0.0), "fov: got 0 degrees"),
         (lambda: Fisheye(5, 5, fov=np.zeros(2)), "fov: got an array"),
+        (lambda: Fisheye(5, 5, mapping="cubic"), "mapping: got 'cubic', expected one of equidistant, equisolid"),
+        (lambda: Fisheye(5, 5, fov=3.2, mapping="orthographic"), "fov: got 183.346 degrees, .* at most 180"),
+        (lambda: Fisheye(5, 5, circle=0.0), "circle: got 0, expected a number above 0"),
+        (lambda: Fisheye(5, 5, distortion=[-0.3]), r"distortion: \[-0.3.*\] folds the picture"),
+        (lambda: Pinhole(5, 5, fov_y=1.5, distortion=[-0.4]), r"distortion: \[-0.4.*\] folds the picture"),
+        (lambda: Pinhole(5, 5, distortion=[0.1] * 6), "distortion: got 6 numbers, expected at most 5"),
+        (lambda: Pinhole(5, 5, distortion=[np.nan]), "distortion: got .nan., expected finite"),
+        (lambda: Pinhole(5, 5, distortion=0.1), "distortion: got an array of shape"),
+        (
+            lambda: camera.from_dict({"projection": "pinhole", "height": 5, "width": 5, "distortion": ["a"]}),
+            "distortion: got .'a'., expected a list of numbers",
+        ),
+        (
+            lambda: camera.from_dict({"projection": "pinhole", "height": 5, "width": 5, "mapping": "equisolid"}),
+            "mapping: unknown key",
+        ),
         (lambda: camera.from_dict({"projection": "cube"}), "projection: got 'cube', expected one of equirectangular"),
         (lambda: camera.from_dict({"projection": "pinhole", "height": 5}), "width: missing"),
         (

@@ -9,6 +9,7 @@ import sys
 from datetime import datetime
 from pathlib import Path
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -341,6 +342,22 @@ def test_options_come_before_the_header(tmp_path, s1, start, toy):
     assert record["altitude_km"] == 3
     assert record["sun_zenith_deg"] == pytest.approx(50, abs=1e-3)
     assert record["sun_azimuth_deg"] == pytest.approx(math.degrees(0.3), abs=1e-3)  # of the header
+
+
+def test_lenses_of_pictures_and_scene_files(tmp_path, start, toy):
+    lens = Fisheye(8, 8, fov=math.radians(170), mapping="equisolid", distortion=[0.02, -0.01], circle=0.9)
+    said = ["--mapping", "equisolid", "--distortion", "0.02,-0.01", "--circle", "0.9", "--fov-deg", "170"]
+    image = tmp_path / "sky.exr"
+    assert main(["render", start, "-o", str(image), "--projection", "fisheye", *said, "--width", "8"]) == 0
+    shot = scene.load(image)
+    assert eqx.tree_equal(shot.scene.camera, lens)
+
+    (tmp_path / "scene.toml").write_text(
+        '[[image]]\nfile = "sky.exr"\nprojection = "pinhole"\nfov_deg = 50\ndistortion = [-0.1, 0, 0, 0.001]\n'
+    )
+    (seen,) = read_scene(tmp_path / "scene.toml").images
+    found = images.find_camera(seen.options, shot.pixels, shot)
+    assert eqx.tree_equal(found, Pinhole(8, 8, fov_y=np.radians(50.0), distortion=[-0.1, 0, 0, 0.001]))
 
 
 def test_the_sun_is_found_from_time_and_place(tmp_path, s1, start, toy):

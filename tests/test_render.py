@@ -193,9 +193,16 @@ def test_scene_round_trip_loses_nothing(tmp_path, s1, lens):
         scene.save(path, pixels, shot)
 
 
-def test_scene_of_many_wavelengths_and_in_double_precision(tmp_path, x64):
+LENSES = {
+    "fisheye": lambda: Fisheye(4, 5, fov=3.0, mapping="equisolid", distortion=[0.01, -1 / 300], circle=1 / 1.1),
+    "pinhole": lambda: Pinhole(4, 5, distortion=[-0.1, 0.01, 0.0, 1 / 3000]),
+}
+
+
+@pytest.mark.parametrize("lens", LENSES.values(), ids=LENSES)
+def test_scene_of_many_wavelengths_and_in_double_precision(tmp_path, x64, lens):
     air = atmosphere.earth(jnp.array([620.0, 410.5, 455.1, 500.0]))
-    shot = make_scene(air, Fisheye(4, 5, fov=3.0), exposure=1 / 3)
+    shot = make_scene(air, lens(), exposure=1 / 3)
     pixels = np.random.default_rng(0).random((4, 5, 4)).astype(np.float32)
     scene.save(tmp_path / "a.exr", pixels, shot)
     found = scene.load(tmp_path / "a.exr")

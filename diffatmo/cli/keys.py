@@ -75,6 +75,21 @@ class Flag:
 
 
 @dataclass(frozen=True)
+class Numbers:
+    """A key whose value is a list of numbers, as text with commas between them."""
+
+    help: str
+    expected: str = "numbers, like -0.2, 0.05"
+
+    def read(self, value: Any) -> list[float]:
+        """The value, or :class:`ValueError`."""
+        items = [float(item) for item in value.split(",")] if isinstance(value, str) else value
+        if not isinstance(items, list):
+            raise ValueError
+        return [Number("").read(item) for item in items]
+
+
+@dataclass(frozen=True)
 class Moment:
     """A key whose value is a date and time with its offset from UTC, of a TOML file or as text."""
 
@@ -90,12 +105,20 @@ class Moment:
         return value
 
 
-Key = Number | Word | Flag | Moment
+Key = Number | Numbers | Word | Flag | Moment
+
+MAPPINGS = ("equidistant", "equisolid", "stereographic", "orthographic")
+"""Those of ``diffatmo.camera``, which takes seconds to import; a test compares the two."""
 
 CAMERA_KEYS: dict[str, Key] = {
     "projection": Word("How pixels map to directions.", ("equirectangular", "fisheye", "pinhole")),
     "upper": Flag("The equirectangular picture ends at the horizon."),
     "fov_deg": Number("Field of view: across the circle of a fisheye, top to bottom of a pinhole.", 0.01, 360),
+    "mapping": Word("Of a fisheye.  [default: equidistant]", MAPPINGS),
+    "distortion": Numbers("k1,k2,k3,p1,p2 of a pinhole (Brown and Conrady), k1,k2,... of a fisheye.  [default: none]"),
+    "circle": Number(
+        "Diameter of a fisheye's circle, in units of the picture's shorter side.  [default: 1]", 0, 100, positive=True
+    ),
     "yaw_deg": Number("Azimuth of the optical axis, or of a panorama's left edge, clockwise from north."),
     "pitch_deg": Number("Elevation of the optical axis.", -90, 90),
     "roll_deg": Number("Clockwise turn of the camera about its optical axis."),
@@ -137,8 +160,8 @@ def options(keys: Mapping[str, Key], shown: Mapping[str, Any] | None = None) -> 
                 flag += f"/--no-{name.replace('_', '-')}"
             elif isinstance(key, Number):
                 kind, metavar = click.FLOAT, "NUMBER"
-            elif isinstance(key, Moment):
-                metavar = "TIME"
+            elif isinstance(key, Moment | Numbers):
+                metavar = "TIME" if isinstance(key, Moment) else "NUMBER,..."
             elif key.choices:
                 kind = click.Choice(key.choices)
             command = click.option(flag, name, type=kind, metavar=metavar, default=None, help=key.help + default)(
