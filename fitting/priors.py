@@ -18,7 +18,7 @@ from diffatmo.atmosphere import Atmosphere
 from diffatmo.numerics import safe_log
 from fitting._errors import FitError
 from fitting.parameters import Parameters
-from fitting.quantities import DERIVED, numbers, quantities
+from fitting.quantities import DERIVED, Quantity, numbers, quantities
 
 
 @dataclass(frozen=True)
@@ -59,14 +59,18 @@ class Priors(eqx.Module):
         return jnp.where(self.relative, logarithm, found - self.value) / self.error
 
 
+def varying(parameters: Parameters) -> tuple[list[str], list[Quantity]]:
+    """The fields, derived ones included, that vary in a fit of ``parameters``, and their numbers."""
+    free = set(parameters.fields)
+    fields = [*parameters.fields, *(name for name in DERIVED if free & set(DERIVED[name].ingredients))]
+    return fields, quantities(fields, [float(nm) for nm in parameters.init.wavelengths])
+
+
 def collect(priors: Sequence[Prior], parameters: Parameters) -> Priors | None:
     """``priors`` on numbers of ``parameters``; raises :class:`FitError` for one that is not of a number that varies."""
     if not priors:
         return None
-    wavelengths = [float(nm) for nm in parameters.init.wavelengths]
-    free = set(parameters.fields)
-    fields = [*parameters.fields, *(name for name in DERIVED if free & set(DERIVED[name].ingredients))]
-    known = quantities(fields, wavelengths)
+    fields, known = varying(parameters)
     index: list[int] = []
     stated: list[Prior] = []
     for prior in priors:

@@ -19,13 +19,16 @@ from diffatmo import atmosphere, imageio, models, scene, sun
 from diffatmo.camera import Equirectangular, Fisheye, Pinhole
 from diffatmo.cli import cache, images, shipped
 from diffatmo.cli import radiance as radiance_command
+from diffatmo.cli.common import InputError
+from diffatmo.cli.fit import make_priors
 from diffatmo.cli.main import main
 from diffatmo.cli.render import picture_size
 from diffatmo.cli.scenefile import FREE, read_scene
 from diffatmo.models.base import Model, Sky
 from diffatmo.models.base import Path as RayPath
 from diffatmo.render import Scene
-from fitting import checkpoint, report
+from fitting import checkpoint, priors, report
+from fitting.parameters import select
 
 ROOT = Path(__file__).parent.parent
 
@@ -474,6 +477,19 @@ def test_files_in_the_readme_can_be_read(tmp_path):
     assert spec.init == str(tmp_path / "start.toml")
     assert spec.images[0].file == tmp_path / "sky_40.exr"
     assert set(spec.tie) <= set(spec.free)
+    parameters = select(atmosphere.earth(), spec.free, spec.tie)
+    known = [prior for table in spec.priors for prior in make_priors(table, parameters)]
+    assert len(known) == 4
+    assert priors.collect(known, parameters) is not None
+
+
+def test_priors_of_a_kind_are_those_of_what_is_free():
+    of = lambda free: {prior.name for prior in make_priors({"kind": "molecular"}, select(atmosphere.earth(), free))}
+    depths = {f"rayleigh_optical_depth_{nm}" for nm in (680, 550, 440)}
+    assert of(["rayleigh_scattering"]) == depths
+    assert of(["rayleigh_scale_height"]) == depths | {"rayleigh_scale_height"}
+    with pytest.raises(InputError, match="'molecular' says nothing of what is free \\(mie_g\\)"):
+        of(["mie_g"])
 
 
 def test_a_fault_of_ours_keeps_its_traceback(tmp_path, atm, monkeypatch):

@@ -276,19 +276,28 @@ def check_profile(names: Sequence[str], parameters: "Parameters") -> tuple[str, 
 
 
 def make_priors(table: Mapping[str, Any], parameters: "Parameters") -> "list[Prior]":
-    """The priors of one table of a scene file."""
+    """The priors of one table of a scene file; of a kind, those on numbers that vary in the fit."""
     from fitting import priors
 
-    said = {key: value for key, value in table.items() if key != "kind"}
-    if table["kind"] == "molecular":
-        return priors.molecular(parameters.init, **said)
-    if table["kind"] == "ozone":
-        return priors.ozone(**(said | {"day_of_year": int(said["day_of_year"])}))
-    if table["kind"] == "aerosol":
-        return priors.aerosol(said["type"], parameters)
-    relative = "relative_error" in said
-    error = said["relative_error" if relative else "error"]
-    return [priors.Prior(said["name"], said["value"], error, relative, "the scene file")]
+    said, kind = {key: value for key, value in table.items() if key != "kind"}, table["kind"]
+    if kind == "number":
+        relative = "relative_error" in said
+        error = said["relative_error" if relative else "error"]
+        return [priors.Prior(said["name"], said["value"], error, relative, "the scene file")]
+    if kind == "molecular":
+        stated = priors.molecular(parameters.init, **said)
+    elif kind == "ozone":
+        stated = priors.ozone(**(said | {"day_of_year": int(said["day_of_year"])}))
+    else:
+        stated = priors.aerosol(said["type"], parameters)
+    _, numbers = priors.varying(parameters)
+    known = {*(number.name for number in numbers), *(number.field for number in numbers)}
+    found = [prior for prior in stated if prior.name in known]
+    if not found:
+        raise InputError(
+            f"prior: kind = {kind!r} says nothing of what is free ({', '.join(parameters.fields)}); leave it out"
+        )
+    return found
 
 
 def image_names(images: Sequence[ImageSpec]) -> list[str]:
