@@ -148,7 +148,7 @@ def gather(observations: Sequence[Observation], wavelengths: Sequence[float]) ->
     """The nuisances of these images, and what they are called; raises :class:`FitError` for groups that cannot be."""
     for kind in KINDS:
         _check_groups(observations, kind)
-    offsets, units, times = _Numbers(), list[float](), dict[int, tuple[float, float]]()
+    offsets, units, times = _Numbers(), list[float](), dict[int, list[float]]()
     of_offsets = np.full((len(observations), len(OFFSETS)), -1)
     for image, observation in enumerate(observations):
         for column, (kind, component) in enumerate(OFFSETS):
@@ -162,7 +162,7 @@ def gather(observations: Sequence[Observation], wavelengths: Sequence[float]) ->
                     f"{observation.name}: {kind}_error: got {error:g}, another image of {group!r} has another"
                 )
             if kind == "aerosol" and observation.time_h is not None:
-                times.setdefault(of_offsets[image, column], (observation.time_h, observation.aerosol_memory_h))
+                times.setdefault(int(of_offsets[image, column]), []).append(observation.time_h)
     factors, pedestals = _Numbers(), _Numbers()
     of_factors = np.stack(
         [
@@ -181,7 +181,7 @@ def gather(observations: Sequence[Observation], wavelengths: Sequence[float]) ->
         moving=tuple(int(component) for component in moving),
         offset_index=jnp.asarray(of_offsets[:, moving]),
         unit=jnp.asarray(units, jnp.result_type(float)),
-        innovation=jnp.asarray(_innovation(len(offsets), times), jnp.result_type(float)),
+        innovation=jnp.asarray(_innovation(len(offsets), times, _memory(observations)), jnp.result_type(float)),
         angle=jnp.asarray(angle, bool),
         factor_index=jnp.asarray(of_factors),
         pedestal_index=jnp.asarray(of_pedestals),
@@ -190,14 +190,26 @@ def gather(observations: Sequence[Observation], wavelengths: Sequence[float]) ->
     )
 
 
-def _innovation(size: int, times: dict[int, tuple[float, float]]) -> Float[np.ndarray, "m m"]:
-    """What makes the aerosols taken at ``times`` (h, and their memory), among ``size`` offsets, independent."""
+def _memory(observations: Sequence[Observation]) -> float:
+    """The hours in which the aerosol of a time series changes; raises :class:`FitError` if its images say different ones."""
+    series = [o for o in observations if group_of(o, "aerosol") is not None and o.time_h is not None]
+    for observation in series:
+        memory, other = observation.aerosol_memory_h, series[0].aerosol_memory_h
+        if memory != other:
+            raise FitError(
+                f"{observation.name}: aerosol_memory_h: got {memory:g}, another image of the series has {other:g}"
+            )
+    return series[0].aerosol_memory_h if series else math.inf
+
+
+def _innovation(size: int, times: dict[int, list[float]], memory: float) -> Float[np.ndarray, "m m"]:
+    """What makes the aerosols of images taken at ``times`` (h), among ``size`` offsets, independent."""
     matrix = np.eye(size)
-    in_order = sorted(times, key=lambda number: times[number][0])
-    for before, after in pairwise(in_order):
-        (earlier, _), (later, memory) = times[before], times[after]
+    # Images that share a factor say together when it was.
+    moments = {number: sum(group) / len(group) for number, group in times.items()}
+    for before, after in pairwise(sorted(moments, key=moments.__getitem__)):
         # Images of the same moment may still differ by what single precision can tell apart.
-        correlation = math.exp(-max(later - earlier, 1e-4 * memory) / memory)
+        correlation = math.exp(-max(moments[after] - moments[before], 1e-4 * memory) / memory)
         scale = math.sqrt(1 - correlation**2)
         matrix[after, after], matrix[after, before] = 1 / scale, -correlation / scale
     return matrix

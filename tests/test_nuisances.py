@@ -464,6 +464,21 @@ def test_refuses_a_group_of_two_minds():
         gather(images, NM)
 
 
+def test_images_of_a_group_say_together_when_it_was():
+    """In whatever order they come; and a series has one memory."""
+    images = [
+        toy_sky.observations(zeniths=(zenith,), aerosol=group, time_h=hour)[0]
+        for zenith, group, hour in ((30.0, "morning", 7.0), (40.0, "morning", 9.0), (50.0, "noon", 12.0))
+    ]
+    for order in ((0, 1, 2), (1, 0, 2), (2, 1, 0)):
+        _, nuisances = gather([images[n] for n in order], NM)
+        covariance = np.linalg.inv(nuisances.innovation.T @ nuisances.innovation)
+        assert covariance[0, 1] == pytest.approx(math.exp(-4 / 6), rel=1e-5)
+    images[2] = dataclasses.replace(images[2], aerosol_memory_h=1.0)
+    with pytest.raises(FitError, match="sun 50: aerosol_memory_h: got 1, another image of the series has 6"):
+        gather(images, NM)
+
+
 def test_what_the_images_do_not_tell_comes_from_what_is_known():
     """A turn about the zenith and the sun's azimuth are one to a sky; each keeps its own share of the error."""
     images = with_free(skewed(zoom=1.0)[:1], pose="free", sun_offset="free", pedestal="free")
