@@ -210,7 +210,7 @@ def fit(
     tolerance: float = TOLERANCE,
     refine: bool = True,
     starts: int | None = None,
-    checkpoint: Path | None = None,
+    checkpoint: str | Path | None = None,
     devices: Sequence[jax.Device] | None = None,
 ) -> FitResult:
     """Recover an atmosphere's parameters from images of its sky, with error bars.
@@ -261,7 +261,7 @@ def fit(
         tolerance=tolerance,
         refine=refine,
         starts=starts,
-        checkpoint=checkpoint,
+        checkpoint=None if checkpoint is None else Path(checkpoint),
         devices=devices,
     )
     return summarise(solution, observations, model, priors=priors, refine=refine, free=free, tie=tie, loss=loss)

@@ -130,7 +130,7 @@ def test_progress_sees_every_step():
 def test_a_fit_goes_on_from_its_checkpoint(tmp_path):
     """Killed after any step, it needs no more steps in all than one more, and finds the same."""
     whole, file = toy_sky.result(), tmp_path / "checkpoint.npz"
-    settings = {"init": toy_sky.start(), "free": FREE, "model": Toy(), "checkpoint": file}
+    settings = {"init": toy_sky.start(), "free": FREE, "model": Toy(), "checkpoint": str(file)}
 
     class Killed(Exception):
         pass
