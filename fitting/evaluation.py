@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from diffatmo.compiling import outermost
 from diffatmo.models.base import Model
@@ -14,7 +15,7 @@ from fitting import model_error
 from fitting.batch import Batch, stack
 from fitting.devices import collected, gathered, placed
 from fitting.linearisation import Linearisation, linearise
-from fitting.observation import Observation
+from fitting.observation import Observation, light_of
 from fitting.parameters import Coordinates, Parameters
 from fitting.priors import Prior, collect
 from fitting.problem import Linear, Predicted, Problem, light, planet_shell, weights, whitened
@@ -30,10 +31,19 @@ def pose(batch: Batch, parameters: Parameters, priors: Sequence[Prior], loss: st
     signal, shell = batch.measured, eqx.filter_eval_shape(planet_shell, model, parameters)
     robust = None if loss is None else Loss(loss, jnp.ones((), signal.dtype))
     fields = Fields.of(batch, FIELD_DEGREE)
-    weight = outermost(weights)(batch, signal)
+    weight = outermost(weights)(batch, jnp.asarray(measured_light(batch), signal.dtype))
     return Problem(
         model, parameters, batch, weight, shell, jnp.ones_like(signal), collect(priors, parameters), robust, fields
     )
+
+
+def measured_light(batch: Batch) -> Float[np.ndarray, "image pixel w"]:
+    """The light in every pixel as far as the images alone tell: less a pedestal, where there may be one."""
+    light, used = np.array(batch.measured), np.asarray(batch.used)
+    for image, numbers in enumerate(np.asarray(batch.nuisances.pedestal_index)):
+        if (numbers >= 0).any():
+            light[image, used[image]] = light_of(light[image, used[image]])
+    return light
 
 
 def evaluated(x: Coordinates, linear: Linear, problem: Problem) -> Linearisation:

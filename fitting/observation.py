@@ -113,7 +113,8 @@ def observe(
         sun: Unit vector towards the sun.
         noise: Standard deviation relative to the signal; a number, or one per channel, pixel, or both.
         noise_shot: Variance per unit of signal (photon noise), like ``noise``.
-        noise_floor: Standard deviation of a dark pixel, like ``noise``; default 1e-4 of the image's median.
+        noise_floor: Standard deviation of a dark pixel, like ``noise``; default 1e-4 of the image's median, with a free
+            pedestal of what that is above its darkest pixels.
         mask: True where the pixel may be used.
         saturation: Pixels with a channel at or above this value are not used.
         sun_exclusion: Radius, in radians, of the disc around the sun that is not used.
@@ -238,12 +239,11 @@ def observe(
         why = ", ".join(f"{count} {reason}" for reason, count in masked.items())
         refuse(f"no pixel is left to fit: of {used.size} pixels {why}")
 
+    floor = 1e-4 * np.median(light_of(image[used], pedestal)) if noise_floor is None else noise_floor
     noises = {
         "noise": _per_pixel(refuse, "noise", noise, image.shape),
         "noise_shot": _per_pixel(refuse, "noise_shot", noise_shot, image.shape),
-        "noise_floor": _per_pixel(
-            refuse, "noise_floor", 1e-4 * np.median(image[used]) if noise_floor is None else noise_floor, image.shape
-        ),
+        "noise_floor": _per_pixel(refuse, "noise_floor", floor, image.shape),
     }
     if np.any(sum(value[used] for value in noises.values()) == 0):
         refuse("noise: it is zero for some pixels, expected a standard deviation > 0")
@@ -271,7 +271,7 @@ def observe(
         masked=dict(masked),
         block=block,
         camera=camera,
-        **(fields | {"spread": single} if block == 1 else _bin(fields, block)),
+        **(fields | {"spread": single} if block == 1 else _bin(fields, block, dark=pedestal != FIXED)),
     )
 
 
@@ -304,8 +304,24 @@ def _per_pixel(refuse: _Refusal, key: str, value: float | np.ndarray, shape: tup
     return array
 
 
-def _bin(fields: dict[str, np.ndarray], block: int) -> dict[str, np.ndarray]:
-    """Averages over ``block`` x ``block`` pixels; of used pixels where the block has any, else of those shown."""
+def light_of(pixels: Float[np.ndarray, "pixel w"], pedestal: str = FREE) -> Float[np.ndarray, "pixel w"]:
+    """About how much light there is in ``pixels`` before it is known how much of them is ``pedestal``.
+
+    What is above the darkest percent of a channel, at least as much as in half of the pixels; of an image without contrast,
+    its size.
+    """
+    if pedestal == FIXED:
+        return pixels
+    low, middle = np.quantile(pixels, (0.01, 0.5), axis=0)
+    contrast = middle - low
+    return np.where(contrast > 0, np.maximum(pixels - low, contrast), np.abs(middle))
+
+
+def _bin(fields: dict[str, np.ndarray], block: int, *, dark: bool) -> dict[str, np.ndarray]:
+    """Averages over ``block`` x ``block`` pixels; of used pixels where the block has any, else of those shown.
+
+    With an unknown pedestal, ``dark``, the light in a pixel is not known, and taken to be the same in all of a block.
+    """
 
     def blocks(x: np.ndarray) -> np.ndarray:
         height, width = x.shape[:2]
@@ -331,8 +347,9 @@ def _bin(fields: dict[str, np.ndarray], block: int) -> dict[str, np.ndarray]:
     directions /= np.maximum(np.linalg.norm(directions, axis=-1, keepdims=True), 1e-6)
     directions[~shown], spread[~shown] = (0, 0, 1), 0
     # Variances of independent pixels add, those of their mean are divided by the number squared.
-    signal = np.maximum(mean("image"), 1e-30)
-    squares = np.where(chosen[..., None], np.nan_to_num(split["noise"] * split["image"]) ** 2, 0)
+    light = np.ones_like(split["image"]) if dark else split["image"]
+    signal = 1.0 if dark else np.maximum(mean("image"), 1e-30)
+    squares = np.where(chosen[..., None], np.nan_to_num(split["noise"] * light) ** 2, 0)
     relative = np.sqrt(squares.sum((2, 3), dtype=np.float64)) / count[..., None] / signal
     dark = np.where(chosen[..., None], split["noise_floor"] ** 2, 0).sum((2, 3), dtype=np.float64)
     binned = {

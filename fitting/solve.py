@@ -39,7 +39,7 @@ from fitting.batch import Batch, stack
 from fitting.checkpoint import Checkpoint, digest, load, save
 from fitting.devices import mesh_of
 from fitting.elimination import starting
-from fitting.evaluation import corrected, evaluated, pose, rescaled, weighed
+from fitting.evaluation import corrected, evaluated, measured_light, pose, rescaled, weighed
 from fitting.least_squares import Factor, known_rows, reduce_images
 from fitting.linearisation import Linearisation, linearise
 from fitting.nuisances import Label, gather
@@ -74,6 +74,9 @@ dense haze the model alone leads 75 of them astray, and its correction there is 
 HOPELESS_MISFIT = 1e4
 """Reduced χ² of images that have nothing to do with the model: another unit, another exposure."""
 
+REWEIGHED, REWEIGHED_AT_MOST = 1.2, 5
+"""Factor, in any image, between sigma and that of the light found, beyond which the fit goes on with that; how often."""
+
 SETTLED = 0.9
 """Ratio of the scales of a robust loss, from one stage to the next, above which it does not fall any further."""
 
@@ -81,6 +84,9 @@ UNLIKE = (
     "the images are not of such a sky: residuals are {:.0f} times the noise; are exposure, units, camera and sun right?"
 )
 ELSEWHERE = "{}; from one of {} other starts, as the one given leads to a χ² {:.2g} times as large"
+UNSETTLED = (
+    "stopped: the noise, which depends on the light that is found, does not settle; are exposure and units right?"
+)
 TOO_COARSE = "converged, but the model's finer self differs from it by {:.0%}: the error bars do not hold"
 
 
@@ -211,6 +217,9 @@ def _first_pass(run: _Run, y: Coordinates, start: Linearisation, problem: Proble
         patience = PATIENCE if starts is None and found is None else None
         fallback = None if found is None else found.best
         best = run.search(y, problem, rough, start=known, patience=patience, fallback=fallback)
+        if problem.batch.nuisances.pedestals:
+            # The measured signal does not tell how much of it is light.
+            best, problem = _reweighed(run, best, problem, rough)
         found = found._replace(best=best, problem=problem) if found else _rescued(run, best, problem, starts, rough)
         if found.interrupted or problem.loss is None:
             return found
@@ -283,7 +292,30 @@ def _final_pass(run: _Run, found: _Found) -> _Found:
             run.search(other.onward, problem, run.tolerance, aside=True, fallback=other) for other in found.rivals
         ]
         best, *rivals = _distinct([best, *others], problem)
+    best, problem = _reweighed(run, best, problem, run.tolerance)
     return found._replace(best=best, rivals=rivals, problem=problem)
+
+
+def _reweighed(run: _Run, best: Point, problem: Problem, tolerance: float) -> tuple[Point, Problem]:
+    """On from ``best`` while sigma is not that of the light there: that of a much brighter sky would hide any misfit."""
+    for again in range(REWEIGHED_AT_MOST + 1):
+        other = weighed(best.y, best.linearisation.radiance, problem)
+        if not best.converged or _noisier(problem, other) <= REWEIGHED:
+            break
+        if again == REWEIGHED_AT_MOST:
+            best = best._replace(converged=False, message=UNSETTLED)
+            break
+        problem = other
+        best = run.search(best.onward, problem, tolerance, fallback=best)
+    return best, problem
+
+
+def _noisier(a: Problem, b: Problem) -> float:
+    """The typical factor, in the image where it is largest, by which sigma differs between ``a`` and ``b``."""
+    used = np.asarray(a.batch.used)
+    logs = [np.log(np.maximum(np.asarray(problem.weight, dtype=np.float64), 1e-300)) for problem in (a, b)]
+    off = np.where(used[..., None], np.abs(logs[0] - logs[1]), 0).mean(axis=-1)
+    return float(np.exp(np.max(off.sum(axis=1) / used.sum(axis=1))))
 
 
 def _refined(run: _Run, found: _Found, finer: Model) -> tuple[_Found, Float[np.ndarray, "n n"]]:
@@ -337,7 +369,7 @@ def _check_finite(bad: Int[np.ndarray, "image 2"], names: Sequence[str]) -> None
 def _check_weights(batch: Batch, names: Sequence[str]) -> None:
     """Refuse pixels whose noise single precision cannot square and divide by."""
     with np.errstate(all="ignore"):
-        whitened = np.asarray(batch.measured / sigma(batch, batch.measured))
+        whitened = np.asarray(batch.measured / sigma(batch, measured_light(batch)))
     bad = np.asarray(batch.used) & ~(np.isfinite(whitened) & (whitened < LARGEST_SIGNAL)).all(axis=-1)
     bad |= np.asarray(batch.used) & ((whitened == 0) & (np.asarray(batch.measured) != 0)).any(axis=-1)
     for name, lost in zip(names, bad.sum(axis=1), strict=True):
@@ -407,7 +439,8 @@ def solve(
     _check_finite(np.asarray(start.bad), names)
     if run.final:
         problem = weighed(y, start.radiance, problem)
-        found = _Found(run.search(y, problem, tolerance), [], problem)
+        best, problem = _reweighed(run, run.search(y, problem, tolerance), problem, tolerance)
+        found = _Found(best, [], problem)
     else:
         found = _first_pass(run, y, start, problem, starts)
         if not found.interrupted:

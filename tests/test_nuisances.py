@@ -421,6 +421,28 @@ def test_noise_is_of_the_light_alone():
     assert np.nanstd(found.whitened[0]) == pytest.approx(1, abs=0.05)
 
 
+def test_a_black_level_of_any_size_costs_no_step():
+    """Half of the pixels negative, or none: the fit is the same."""
+    raised = []
+    for level in (0.0, -1.0, 3.0):
+        random = np.random.default_rng(0)
+        light = toy_sky.image(toy_sky.truth(), 50.0)
+        pixels = light * (1 + 0.01 * random.standard_normal(light.shape)) + level * np.median(light)
+        options = {"camera": toy_sky.CAMERA, "altitude": 0.1, "sun": toy_sky.towards_sun(50.0), "pedestal": "free"}
+        raised.append(fitting.observe(pixels, **options))
+    init = toy_sky.change(toy_sky.truth(), mie_scattering=5e-3, mie_g=0.7)
+    found = [
+        fitting.fit([image], init=init, free=["mie_scattering", "mie_g"], tie=TIE, model=Toy()) for image in raised
+    ]
+    for other in found:
+        assert other.message.startswith("converged:")
+        assert "other starts" not in other.message
+        assert other.reduced_chi2 == pytest.approx(1, abs=0.06)
+        assert other.iterations == found[0].iterations
+        for mine, first in zip(other.parameters, found[0].parameters, strict=True):
+            assert abs(mine.value - first.value) < 0.05 * first.standard_error
+
+
 # Names and choices --------------------------------------------------------------------------------------------------
 
 

@@ -128,6 +128,20 @@ def test_four_directions_stand_for_a_block():
     assert rest < wrong / 10
 
 
+def test_a_black_level_is_no_light():
+    """With a free pedestal neither noise floor nor the noise of averaged pixels depends on what was added to an image."""
+    light = 1 + np.random.default_rng(0).random((32, 64, 3))
+    options = {"pedestal": "free", "noise": 0.1, "max_pixels": 32 * 64 // 8}
+    plain, *raised = (observe(light + level, **options) for level in (0.0, -1.5, -10.0, 100.0))
+    assert plain.block > 1
+    for found in raised:
+        np.testing.assert_allclose(found.noise_floor, plain.noise_floor, rtol=1e-4)
+        np.testing.assert_allclose(found.noise, plain.noise, rtol=1e-6)
+    np.testing.assert_allclose(plain.noise[plain.used], 0.1 / plain.block, rtol=1e-6)
+    # An image without contrast has no darkest pixels.
+    assert np.all(observe(-np.ones((32, 64, 3)), pedestal="free").noise_floor == np.float32(1e-4))
+
+
 def test_binning_leaves_masked_pixels_out():
     pixels = np.ones((32, 64, 3))
     pixels[0, 0] = np.nan

@@ -345,6 +345,21 @@ def test_images_in_another_unit_do_not_converge(factor):
     assert all(np.isfinite(estimate.value) for estimate in found.parameters)
 
 
+@pytest.mark.parametrize("factor", [1e-3, 1e-6])
+def test_noise_of_another_sky_hides_no_misfit(factor):
+    """Images much darker than any sky: that of 1 % of the sky first found would be more than all of their light."""
+    image = toy_sky.observations()[1]
+    darker = eqx.tree_at(
+        lambda o: (o.image, o.noise_floor),
+        image,
+        (image.image * np.float32(factor), image.noise_floor * np.float32(factor)),
+    )
+    init = toy_sky.change(toy_sky.truth(), mie_scattering=5e-3, mie_g=0.7)
+    found = fit([darker], init=init, free=["mie_scattering", "mie_g"], tie={"mie_scattering": "start"}, model=Toy())
+    assert not found.converged
+    assert found.reduced_chi2 > 100
+
+
 @pytest.mark.parametrize(("factor", "noise"), [(1e-19, 0.01), (1e30, 0.01), (1.0, 1e-30)])
 def test_numbers_that_single_precision_cannot_square_are_refused(factor, noise):
     image = toy_sky.observations()[0]
