@@ -8,7 +8,7 @@ know the truth. ``known``: exposures are known. ``unknown``: every picture has a
 white balance. ``one``: only the picture with the sun at 65°, which cannot tell everything; its error bars have to say so.
 
 Of a spectral number the tables of single fits show the band that is farthest off; medians and shares are those of all
-bands. The pictures take half an hour on two cores; they are kept in a folder of the system's temporary files, and ``--trace``
+bands. The pictures take about an hour of one core; they are kept in a folder of the system's temporary files, and ``--trace``
 makes no more than them.
 """
 
