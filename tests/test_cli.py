@@ -27,7 +27,7 @@ from diffatmo.cli.scenefile import FREE, read_scene
 from diffatmo.models.base import Model, Sky
 from diffatmo.models.base import Path as RayPath
 from diffatmo.render import Scene
-from fitting import checkpoint, priors, report
+from fitting import checkpoint, priors, report, search
 from fitting.parameters import select
 
 ROOT = Path(__file__).parent.parent
@@ -394,10 +394,11 @@ def test_channels_are_matched_by_wavelength(tmp_path, s1, start, toy):
     assert np.allclose(fitted.rayleigh_scattering, s1.rayleigh_scattering[jnp.array([2, 0, 1])], rtol=0.03)
 
 
-def test_fit_that_does_not_converge_is_written_all_the_same(tmp_path, s1, start, toy):
+def test_fit_that_does_not_converge_is_written_all_the_same(tmp_path, s1, start, toy, capfd):
     image = toy_image(tmp_path / "sky.exr", s1, zenith=40)
     out = tmp_path / "out"
     assert main(["fit", image, "--init", start, *TOY_FREE, "--max-steps", "1", "-o", str(out)]) == 1
+    assert "not converged in the steps allowed" in capfd.readouterr().out
     assert not json.loads((out / "fit.json").read_text())["converged"]
     assert (out / "atmosphere.toml").exists()
     assert (out / "report.html").exists()
@@ -462,6 +463,23 @@ def test_shipped_images_are_found():
     for path in shipped.scenes():
         assert path.name == "scene.toml"
         assert list(path.parent.glob("*.exr"))
+
+
+def test_an_interrupted_fit_is_written_and_goes_on(tmp_path, s1, start, toy, capfd, monkeypatch):
+    image, out = str(toy_image(tmp_path / "sky.exr", s1, zenith=40)), tmp_path / "out"
+
+    def interrupt(history, tolerance):
+        if len(history) > 1:
+            raise KeyboardInterrupt
+
+    command = ["fit", image, "--init", start, *TOY_FREE, "-o", str(out)]
+    with monkeypatch.context() as patch:
+        patch.setattr(search, "steps_left", interrupt)
+        assert main(command) == 130
+    assert "interrupted by the user; the same command with --resume goes on" in capfd.readouterr().out
+    assert json.loads((out / "fit.json").read_text())["converged"] is False
+    assert main([*command, "--resume"]) == 0
+    assert json.loads((out / "fit.json").read_text())["converged"] is True
 
 
 def test_default_parameters_are_those_of_an_atmosphere():

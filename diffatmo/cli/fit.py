@@ -9,7 +9,15 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from diffatmo.cli import keys, many, shipped
-from diffatmo.cli.common import InputError, make_console, make_model, overwrite_option, printable, read_atmosphere
+from diffatmo.cli.common import (
+    INTERRUPTED,
+    InputError,
+    make_console,
+    make_model,
+    overwrite_option,
+    printable,
+    read_atmosphere,
+)
 from diffatmo.cli.images import observe
 from diffatmo.cli.scenefile import (
     FREE,
@@ -154,11 +162,12 @@ def fit(
             report.check_writable(directory, overwrite=overwrite or begun[directory])
             if overwrite:
                 (directory / checkpoint.FILE).unlink(missing_ok=True)
-    converged = [
-        run(job, directory, overwrite=overwrite or begun[directory], quiet=not first, write=first)
-        for directory, job in jobs.items()
-    ]
-    return 0 if all(converged) else NOT_CONVERGED
+    statuses: list[int] = []
+    for directory, job in jobs.items():
+        statuses.append(run(job, directory, overwrite=overwrite or begun[directory], quiet=not first, write=first))
+        if statuses[-1] == INTERRUPTED:
+            break
+    return max(statuses)
 
 
 def join(hosts: tuple[str, int, int] | None) -> bool:
@@ -318,13 +327,13 @@ def fitting_model(name: str) -> "Model":
     return Bruneton.reduced() if name == "bruneton" else make_model(name)
 
 
-def run(job: Job, directory: Path, *, overwrite: bool, quiet: bool = False, write: bool = True) -> bool:
-    """Fit, write the report, show the table unless ``quiet``; whether the fit converged."""
+def run(job: Job, directory: Path, *, overwrite: bool, quiet: bool = False, write: bool = True) -> int:
+    """Fit, write the report, show the table unless ``quiet``; the exit status."""
     from rich.text import Text
 
     import fitting
-    from fitting import checkpoint, report
-    from fitting.search import INTERRUPTED, steps_left
+    from fitting import checkpoint, report, search
+    from fitting.search import steps_left
     from fitting.solve import TOLERANCE
 
     console = make_console(quiet=quiet)
@@ -373,14 +382,18 @@ def run(job: Job, directory: Path, *, overwrite: bool, quiet: bool = False, writ
             result = fitting.profile(result, *job.profile, progress=show_point)
         elif job.profile:
             console.print("No profiles: they are about an optimum, and none was found.")
+        interrupted = result.message == search.INTERRUPTED
+        status = INTERRUPTED if interrupted else 0 if result.converged else NOT_CONVERGED
         if not write:
-            return result.converged
+            return status
         report.write(result, directory, truth=job.truth, overwrite=overwrite)
-    if result.message != INTERRUPTED:
+    if not interrupted:
         file.unlink(missing_ok=True)
     console.print(report.table(result, job.truth))
+    if not result.converged:
+        console.print(f"{result.message}{'; the same command with --resume goes on' * interrupted}", soft_wrap=True)
     console.print(f"Report: {directory / 'report.html'}", soft_wrap=True)
-    return result.converged
+    return status
 
 
 def run_quietly(job: Job, directory: Path, overwrite: bool) -> None:
