@@ -89,6 +89,10 @@ UNSETTLED = (
 )
 TOO_COARSE = "converged, but the model's finer self differs from it by {:.0%}: the error bars do not hold"
 
+RESTLESS = (
+    "stopped: the model's finer self still moves the optimum by {:.1f} standard errors: the error bars do not hold"
+)
+
 
 class Solution(NamedTuple):
     """The best point found and the linear model around it."""
@@ -330,6 +334,8 @@ def _refined(run: _Run, found: _Found, finer: Model) -> tuple[_Found, Float[np.n
             assert problem.correction is not None
             # What the model alone says there.
             light = best.linearisation.radiance / problem.correction
+        else:
+            best = best._replace(converged=False, message=RESTLESS.format(_apart(before, best, problem)))
     except KeyboardInterrupt:
         best = found.best._replace(converged=False, message=INTERRUPTED)
         return found._replace(best=best), np.zeros((best.y.size, best.y.size))
