@@ -202,7 +202,7 @@ def test_packed_tables_give_aerosol_back():
     """The first wavelength is stored and comes back exactly; the others within what multiple scattering adds to the red."""
     air = earth()
     tables = solved(SMALL, air)
-    packed = eqx.tree_at(lambda s: s.packed, tables, True)
+    packed = replace(tables, packed=True)
     altitude, mu, mu_s, nu = rays(300, seed=3)
     full, recovered = (np.asarray(seen(sky, altitude, mu, mu_s, nu).inscatter) for sky in (tables, packed))
     np.testing.assert_allclose(recovered[:, 0], full[:, 0], rtol=1e-5)
