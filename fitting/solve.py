@@ -67,9 +67,13 @@ PATIENCE = 40
 OTHERS = 3
 """Starts that are tried then, at most: fewer if one leads to a better χ² than that, or to the same minimum again."""
 
-CORRECTIONS, MOVED = 6, 1.0
-"""How often the finer model is asked at most, and by how many standard errors the optimum may move without asking it again: in
-dense haze the model alone leads 75 of them astray, and its correction there is short by a quarter."""
+CORRECTIONS, LEFT = 6, 0.5
+"""How often the finer model is asked at most, and how many standard errors the optimum may have left to go without asking it
+again: in dense haze the model alone leads 75 of them astray, and its correction there is short by a quarter."""
+
+GROWTH = 10.0
+"""Relative growth of the correction along the way from the model's optimum to the finer one's, over the correction: 6 and more
+in dense haze."""
 
 HOPELESS_MISFIT = 1e4
 """Reduced χ² of images that have nothing to do with the model: another unit, another exposure."""
@@ -326,16 +330,20 @@ def _refined(run: _Run, found: _Found, finer: Model) -> tuple[_Found, Float[np.n
     """The optimum if the images are explained by ``finer`` there, and the covariance of what that may leave of errors."""
     best, problem, light = found.best, found.problem, found.best.linearisation.radiance
     try:
+        way = math.inf
         for _ in range(CORRECTIONS):
             before, problem = best, corrected(best.y, light, found.problem, finer)
             best = run.search(before.onward, problem, run.tolerance)
-            if not best.converged or _apart(before, best, problem) < MOVED:
+            # Each way is shorter than the last by the same factor; the first by about what the correction grows along it.
+            last, way = way, _apart(before, best, problem)
+            rate = min(way / last if last < math.inf else GROWTH * float(model_error.deviation(problem).max()), 0.9)
+            if not best.converged or way * rate / (1 - rate) < LEFT:
                 break
             assert problem.correction is not None
             # What the model alone says there.
             light = best.linearisation.radiance / problem.correction
         else:
-            best = best._replace(converged=False, message=RESTLESS.format(_apart(before, best, problem)))
+            best = best._replace(converged=False, message=RESTLESS.format(way))
     except KeyboardInterrupt:
         best = found.best._replace(converged=False, message=INTERRUPTED)
         return found._replace(best=best), np.zeros((best.y.size, best.y.size))
