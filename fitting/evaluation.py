@@ -7,11 +7,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from diffatmo.compiling import outermost
 from diffatmo.models.base import Model
 from fitting import model_error
+from fitting._errors import FitError
 from fitting.batch import Batch, stack
 from fitting.devices import collected, gathered, placed
 from fitting.linearisation import Linearisation, linearise
@@ -51,6 +52,14 @@ def evaluated(x: Coordinates, linear: Linear, problem: Problem) -> Linearisation
     mesh = problem.batch.mesh
     found = outermost(linearise)(x, linear, placed(problem))
     return collected(jax.block_until_ready(found), mesh)
+
+
+def check_finite(bad: Int[np.ndarray, "image 2"], names: Sequence[str], where: str) -> None:
+    """Refuse a point at which the model or its derivatives are not finite in so many of the pixels used."""
+    for what, counts in zip(("radiance", "derivatives"), bad.T, strict=True):
+        for name, lost in zip(names, counts, strict=True):
+            if lost:
+                raise FitError(f"{name}: the model's {what} {where}: not finite in {lost} of the pixels used")
 
 
 def corrected(y: Coordinates, radiance: Predicted, problem: Problem, finer: Model) -> Problem:

@@ -134,7 +134,7 @@ def _linearise(x: Coordinates, linear: Linear, problem: Problem) -> Linearisatio
 
 
 class Derivatives(NamedTuple):
-    """The radiance of all pixels, its derivatives, and where they are not finite, as in :class:`Linearisation`."""
+    """The radiance of all pixels, and its derivatives along the tangents of :class:`Linearisation`."""
 
     radiance: Predicted
     tangents: Float[Array, "image pixel w colour"]

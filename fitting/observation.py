@@ -271,7 +271,7 @@ def observe(
         masked=dict(masked),
         block=block,
         camera=camera,
-        **(fields | {"spread": single} if block == 1 else _bin(fields, block, dark=pedestal != FIXED)),
+        **(fields | {"spread": single} if block == 1 else _bin(fields, block, raised=pedestal != FIXED)),
     )
 
 
@@ -317,10 +317,10 @@ def light_of(pixels: Float[np.ndarray, "pixel w"], pedestal: str = FREE) -> Floa
     return np.where(contrast > 0, np.maximum(pixels - low, contrast), np.abs(middle))
 
 
-def _bin(fields: dict[str, np.ndarray], block: int, *, dark: bool) -> dict[str, np.ndarray]:
+def _bin(fields: dict[str, np.ndarray], block: int, *, raised: bool) -> dict[str, np.ndarray]:
     """Averages over ``block`` x ``block`` pixels; of used pixels where the block has any, else of those shown.
 
-    With an unknown pedestal, ``dark``, the light in a pixel is not known, and taken to be the same in all of a block.
+    ``raised`` by an unknown pedestal, the light in a pixel is not known, and taken to be the same in all of a block.
     """
 
     def blocks(x: np.ndarray) -> np.ndarray:
@@ -347,8 +347,8 @@ def _bin(fields: dict[str, np.ndarray], block: int, *, dark: bool) -> dict[str, 
     directions /= np.maximum(np.linalg.norm(directions, axis=-1, keepdims=True), 1e-6)
     directions[~shown], spread[~shown] = (0, 0, 1), 0
     # Variances of independent pixels add, those of their mean are divided by the number squared.
-    light = np.ones_like(split["image"]) if dark else split["image"]
-    signal = 1.0 if dark else np.maximum(mean("image"), 1e-30)
+    light = np.ones_like(split["image"]) if raised else split["image"]
+    signal = 1.0 if raised else np.maximum(mean("image"), 1e-30)
     squares = np.where(chosen[..., None], np.nan_to_num(split["noise"] * light) ** 2, 0)
     relative = np.sqrt(squares.sum((2, 3), dtype=np.float64)) / count[..., None] / signal
     dark = np.where(chosen[..., None], split["noise_floor"] ** 2, 0).sum((2, 3), dtype=np.float64)

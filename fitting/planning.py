@@ -30,7 +30,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from diffatmo import transmittance
 from diffatmo.atmosphere import Atmosphere
@@ -41,7 +41,7 @@ from diffatmo.numerics import safe_log
 from fitting._errors import FitError
 from fitting.batch import Batch, stack
 from fitting.elimination import eliminate, starting, without
-from fitting.evaluation import evaluated, pose
+from fitting.evaluation import check_finite, evaluated, pose
 from fitting.least_squares import known_rows, slopes, triangle
 from fitting.linearisation import derivatives, linearise
 from fitting.nuisances import gather
@@ -236,7 +236,7 @@ def of_observations(observations: Sequence[Observation], parameters: Parameters,
     problem = pose(batch, parameters, (), None, model)
     problem = replace(problem, shell=outermost(planet_shell)(model, parameters))
     found = evaluated(problem.start, jnp.zeros(batch.nuisances.linear, problem.start.dtype), problem)
-    _check_finite(np.asarray(found.bad), [observation.name for observation in observations])
+    check_finite(np.asarray(found.bad), [observation.name for observation in observations], "in the atmosphere given")
     linear = jnp.asarray(starting(np.asarray(found.radiance), batch), problem.start.dtype)
     y = eliminate(jnp.concatenate([problem.start, linear]), found, problem)
     problem = replace(problem, weight=weights(batch, light(y, found.radiance, problem)))
@@ -255,13 +255,6 @@ def of_priors(priors: Sequence[Prior], parameters: Parameters) -> Information:
 
 def _prior_slope(y: Coordinates, parameters: Parameters, known: Priors) -> Float[Array, "k n"]:
     return jax.jacfwd(lambda y: known.residuals(parameters.atmosphere(y)))(y)
-
-
-def _check_finite(bad: Int[np.ndarray, "image 2"], names: Sequence[str]) -> None:
-    for what, counts in zip(("radiance", "derivatives"), bad.T, strict=True):
-        for name, lost in zip(names, counts, strict=True):
-            if lost:
-                raise FitError(f"{name}: the model's {what} are not finite in {lost} of the pixels used")
 
 
 def of_shots(
@@ -285,7 +278,7 @@ def of_shots(
         lost = [~np.isfinite(values).reshape(*values.shape[:2], -1).all(axis=-1) for values in found]
         used = np.asarray(problem.batch.used)
         bad = np.stack([np.sum(used & values, axis=1) for values in lost], axis=-1)
-        _check_finite(bad, [frame.name for frame in frames.values()])
+        check_finite(bad, [frame.name for frame in frames.values()], "in the atmosphere given")
     result = []
     for shot in shots:
         if isinstance(shot, Photo):

@@ -76,7 +76,7 @@ class Step(NamedTuple):
     ``chi2`` is that of the point tried (infinite where the model was), ``accepted`` whether it became the current one;
     ``change`` is the largest change of a coordinate that led to it (about the relative change of a parameter),
     ``distance`` that from the current point to the optimum, in standard errors, ``damping`` the λ of
-    the next step, and ``stage`` 1 while sigma comes from the measured signal, 2 when it comes from the fitted one.
+    the next step, and ``stage`` counts the searches of the fit: the first has sigma from the measured signal.
     """
 
     step: int

@@ -28,7 +28,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from diffatmo.atmosphere import Atmosphere
 from diffatmo.compiling import compile_ahead, outermost
@@ -39,7 +39,7 @@ from fitting.batch import Batch, stack
 from fitting.checkpoint import Checkpoint, digest, load, save
 from fitting.devices import mesh_of
 from fitting.elimination import starting
-from fitting.evaluation import corrected, evaluated, measured_light, pose, rescaled, weighed
+from fitting.evaluation import check_finite, corrected, evaluated, measured_light, pose, rescaled, weighed
 from fitting.least_squares import Factor, known_rows, reduce_images
 from fitting.linearisation import Linearisation, linearise
 from fitting.nuisances import Label, gather
@@ -372,14 +372,6 @@ def _shares(best: Point, problem: Problem) -> dict[str, Any]:
     return shares
 
 
-def _check_finite(bad: Int[np.ndarray, "image 2"], names: Sequence[str]) -> None:
-    """Refuse start values at which the model or its derivatives are not finite where they are needed."""
-    for what, counts in zip(("radiance", "derivatives"), bad.T, strict=True):
-        for name, lost in zip(names, counts, strict=True):
-            if lost:
-                raise FitError(f"{name}: the model's {what} at the start: not finite in {lost} of the pixels used")
-
-
 def _check_weights(batch: Batch, names: Sequence[str]) -> None:
     """Refuse pixels whose noise single precision cannot square and divide by."""
     with np.errstate(all="ignore"):
@@ -450,7 +442,7 @@ def solve(
         run.final, run.step_size = saved.final, saved.step_size
         y = jnp.asarray(saved.y, problem.start.dtype)
         start = run.evaluate(*problem.split(y), problem)
-    _check_finite(np.asarray(start.bad), names)
+    check_finite(np.asarray(start.bad), names, "at the start")
     if run.final:
         problem = weighed(y, start.radiance, problem)
         best, problem = _reweighed(run, run.search(y, problem, tolerance), problem, tolerance)

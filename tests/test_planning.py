@@ -443,5 +443,7 @@ def test_a_model_that_is_not_finite_is_refused():
         def sky(self, atmosphere):
             return toy_sky.ToySky(jax.tree.map(lambda x: x * np.nan, atmosphere))
 
-    with pytest.raises(fitting.FitError, match="across, sun at 60°: the model's radiance are not finite in"):
+    with pytest.raises(
+        fitting.FitError, match="across, sun at 60°: the model's radiance in the atmosphere given: not finite in"
+    ):
         of_shots([SHOTS[1]], parameters(), Broken(), sensor=Sensor(), altitude=0.1)

@@ -32,31 +32,11 @@ from diffatmo.camera import Equirectangular
 from diffatmo.render import Scene, render
 
 NOISE, ALTITUDE_KM, STEPS = 0.01, 0.1, 3
-FREE = {
-    3: ("mie_g", "mie_scale_height", "rayleigh_scale_height"),
-    6: ("mie_g", "mie_scale_height", "rayleigh_scale_height", "rayleigh_scattering"),
-    9: ("mie_g", "mie_scale_height", "rayleigh_scale_height", "rayleigh_scattering", "mie_scattering"),
-    12: (
-        "mie_g",
-        "mie_scale_height",
-        "rayleigh_scale_height",
-        "rayleigh_scattering",
-        "mie_scattering",
-        "ground_albedo",
-    ),
-    20: (
-        "mie_g",
-        "mie_scale_height",
-        "rayleigh_scale_height",
-        "rayleigh_scattering",
-        "mie_scattering",
-        "ground_albedo",
-        "mie_absorption",
-        "ozone_absorption",
-        "ozone_center_altitude",
-        "ozone_half_width",
-    ),
-}
+ORDER = (
+    *("mie_g", "mie_scale_height", "rayleigh_scale_height", "rayleigh_scattering", "mie_scattering", "ground_albedo"),
+    *("mie_absorption", "ozone_absorption", "ozone_center_altitude", "ozone_half_width"),
+)
+FREE = {3: ORDER[:3], 6: ORDER[:4], 9: ORDER[:5], 12: ORDER[:6], 20: ORDER}
 """Free fields by the number of their numbers at three wavelengths."""
 PIXELS = (1e3, 1e4, 1e5, 1e6, 1e7)
 IMAGES = (1, 4, 16, 64)
