@@ -152,9 +152,10 @@ def test_a_killed_run_is_taken_up_where_it_was(tmp_path):
         assert run.returncode == -signal.SIGKILL
         if Path("/proc").is_dir():
             wait_until(lambda run=run: not processes(run.pid))
-        # What was complete is untouched, and the table is whole.
+        # What was complete is untouched, and the table, if the run came to write one, is whole.
         assert all(path.stat().st_mtime_ns == at for path, at in complete.items())
-        assert all(row["mie_g"] for row in table(out).values())
+        if (out / results.FILE).exists():
+            assert all(row["mie_g"] for row in table(out).values())
     run = start(out, files, 1)
     shown, errors = run.communicate()
     assert (run.returncode, errors) == (0, "")
