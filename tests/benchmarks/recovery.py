@@ -24,6 +24,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
+from scipy.ndimage import uniform_filter
 
 import diffatmo
 import fitting
@@ -35,6 +36,8 @@ import generate
 
 SEED, OTHER_PLANET = 12, 5
 NOISE = 0.01
+NEIGHBOURS = (5, 9)
+"""Pixels around one, along its column and its row, that tell the error of its Monte Carlo."""
 TIE = {"mie": "angstrom", "ozone_absorption": "dobson"}
 MODES, ONE = ("known", "unknown", "one"), (65.0,)
 ASKED = {
@@ -89,11 +92,12 @@ def atmospheres(count: int) -> list[diffatmo.Atmosphere]:
     return found
 
 
-def traced(truth: diffatmo.Atmosphere, number: int, zenith_deg: float, samples: int) -> tuple[np.ndarray, float]:
-    """A picture of atmosphere ``number`` and its relative standard error, made or found.
+def traced(truth: diffatmo.Atmosphere, number: int, zenith_deg: float, samples: int) -> tuple[np.ndarray, np.ndarray]:
+    """A picture of atmosphere ``number`` and the relative standard error of its pixels, made or found.
 
     The channels of one trace come from the same paths, and their errors are alike, which no fit expects: every channel is
-    traced on its own.
+    traced on its own. A pixel's error estimated from its own paths is large where the value is, so that weights would pull
+    down: it is the root mean square of those around it.
     """
     means, errors = [], []
     for channel in range(truth.wavelengths.size):
@@ -118,7 +122,7 @@ def traced(truth: diffatmo.Atmosphere, number: int, zenith_deg: float, samples: 
             means.append(kept["mean"].astype(float))
             errors.append(kept["error"].astype(float))
     mean, error = (np.concatenate(part, axis=-1) for part in (means, errors))
-    return mean, float(np.sqrt(np.mean((error / mean) ** 2)))
+    return mean, np.sqrt(uniform_filter((error / mean) ** 2, size=(*NEIGHBOURS, 1), mode="nearest"))
 
 
 def blind_start(truth: diffatmo.Atmosphere) -> diffatmo.Atmosphere:
@@ -149,7 +153,7 @@ def recover(truth: diffatmo.Atmosphere, number: int, mode: str, samples: int) ->
                 camera=generate.camera(),
                 altitude=generate.ALTITUDE_KM,
                 sun=generate.towards(zenith_deg),
-                noise=math.hypot(NOISE, error),
+                noise=np.hypot(NOISE, error),
                 name=f"{zenith_deg:g}°",
                 **settings,
             )
@@ -200,7 +204,7 @@ def run(console: Console, mode: str, truths: list[diffatmo.Atmosphere], samples:
     silent = []
     for number, truth in enumerate(truths):
         result = recover(truth, number, mode, samples)
-        off, noise = errors(result), [float(observation.noise.max()) for observation in result.observations]
+        off, noise = errors(result), [float(np.median(observation.noise)) for observation in result.observations]
         every.append(off)
         worst = {name: max(bands, key=lambda e: abs(e.off)) for name, bands in off.items()}
         pulls = [e.pull for bands in off.values() for e in bands]
