@@ -29,7 +29,7 @@ LUMINANCE = np.linalg.inv(XYZ_TO_SRGB)[1]
 
 
 @cache
-def _observer() -> tuple[np.ndarray, np.ndarray]:
+def observer() -> tuple[np.ndarray, np.ndarray]:
     """Wavelengths, nm, and colour-matching functions (n, 3) of the CIE 1931 2° observer."""
     with resources.files("diffatmo").joinpath("data", "cie1931_2deg.csv").open(encoding="utf-8") as file:
         table = np.loadtxt((line for line in file if not line.startswith(("#", "wavelength"))), delimiter=",")
@@ -44,7 +44,7 @@ def xyz_weights(wavelengths: Spectrum) -> Float[Array, "w 3"]:
     outer two, and that is integrated against the observer by the trapezoidal rule in steps of 1 nm, so that its curves
     do not undersample a spectrum given at a handful of wavelengths. A radiance of 1 everywhere has X = Y = Z = 1.
     """
-    nodes, curves = _observer()
+    nodes, curves = observer()
     fine = np.arange(nodes[0], nodes[-1] + 0.5)
     matching = np.stack([np.interp(fine, nodes, curve) for curve in curves.T], axis=-1)
     order = jnp.argsort(wavelengths)

@@ -13,10 +13,23 @@ from jaxtyping import Array, Bool, Float
 
 from diffatmo.camera import Camera
 from fitting._errors import FitError
-from fitting.nuisances import AEROSOL, FOCAL, OFFSETS, POSE, SUN, Nuisances, displace, gather, rotate, sun_axes
+from fitting.nuisances import (
+    AEROSOL,
+    FOCAL,
+    OFFSETS,
+    POSE,
+    SHADING,
+    SUN,
+    Nuisances,
+    displace,
+    gather,
+    rotate,
+    shading,
+    sun_axes,
+)
 from fitting.observation import FIXED, Observation
 
-PIXEL_FIELDS = ("directions", "measured", "used", "noise", "noise_shot", "noise_floor")
+PIXEL_FIELDS = ("directions", "measured", "used", "noise", "noise_shot", "noise_floor", "shading")
 """What a :class:`Batch` has for every pixel."""
 
 TILE = 8192
@@ -31,6 +44,8 @@ class Views(NamedTuple):
     directions: Float[Array, "image pixel part 3"]
     aerosol: Float[Array, " image"] | None
     """Logarithm of the factor; None if it is 1 for all."""
+    response: Float[Array, "image channel w"] | None
+    """What the channels see of the wavelengths; None if they are the wavelengths."""
 
 
 class Batch(eqx.Module):
@@ -45,11 +60,14 @@ class Batch(eqx.Module):
     noise: Float[Array, "image pixel w"]
     noise_shot: Float[Array, "image pixel w"]
     noise_floor: Float[Array, "image pixel w"]
+    shading: Float[Array, "image pixel w s"]
+    """Columns of the free coefficients of shading, in their order among the offsets."""
     exposure_value: Float[Array, " image"]
     nuisances: Nuisances
     sun_axes: Float[Array, "image 2 3"]
     cameras: tuple[Camera | None, ...]
     """Those whose focal length is free; empty if none is."""
+    response: Float[Array, "image channel w"] | None = None
     tiles: int = eqx.field(static=True, default=1)
     """Into how many tiles the pixels of an image go, on each device."""
     mesh: Mesh | None = eqx.field(static=True, default=None)
@@ -59,11 +77,16 @@ class Batch(eqx.Module):
         """What radiance is multiplied by."""
         return self.exposure_value[:, None, None] * self.nuisances.factor(linear)
 
+    def modulation(self, moved: Float[Array, "image moving"]) -> Float[Array, "image pixel w"]:
+        """What vignetting and tone make of the light."""
+        own = np.flatnonzero([SHADING.start <= component < SHADING.stop for component in self.nuisances.moving])
+        return jnp.exp(jnp.einsum("ipws,is->ipw", self.shading, moved[:, own], precision="highest"))
+
     def views(self, moved: Float[Array, "image moving"]) -> Views:
         """The views of the images with their free offsets ``moved``."""
         moving = self.nuisances.moving
         if not moving:
-            return Views(self.altitude, self.sun, self.directions, None)
+            return Views(self.altitude, self.sun, self.directions, None, self.response)
         by = jnp.zeros((len(self.sun), len(OFFSETS)), moved.dtype).at[:, np.array(moving)].set(moved)
         directions = self.directions
         if FOCAL in moving:
@@ -79,6 +102,7 @@ class Batch(eqx.Module):
             displace(self.sun, self.sun_axes, by[:, SUN]),
             rotate(directions, by[:, None, None, POSE]),
             by[:, AEROSOL] if AEROSOL in moving else None,
+            self.response,
         )
 
 
@@ -91,21 +115,15 @@ def stack(observations: Sequence[Observation], wavelengths: Sequence[float], mes
         if count > 1:
             raise FitError(f"{name}: the name of {count} observations, expected different names")
     for observation in observations:
-        channels = observation.image.shape[-1]
-        if channels != len(wavelengths):
-            given = ", ".join(f"{nm:g}" for nm in wavelengths)
-            raise FitError(
-                f"{observation.name}: the image has {channels} channels, expected {len(wavelengths)}, one for each "
-                f"wavelength of the atmosphere ({given} nm)"
-            )
+        _check_channels(observation, observations[0], wavelengths)
     most, devices = max(int(observation.shown.sum()) for observation in observations), 1 if mesh is None else mesh.size
     tiles = math.ceil(most / (devices * TILE))
     size = devices * tiles * math.ceil(most / (devices * tiles))
 
-    def padded(field: str, fill: Any) -> Array:
+    def padded(field: str | Sequence[np.ndarray], fill: Any) -> Array:
         rows = []
-        for observation in observations:
-            value = getattr(observation, field)[observation.shown]
+        for index, observation in enumerate(observations):
+            value = (getattr(observation, field) if isinstance(field, str) else field[index])[observation.shown]
             rows.append(np.concatenate([value, np.broadcast_to(fill, (size - len(value), *value.shape[1:]))]))
         return number(np.stack(rows))
 
@@ -119,6 +137,15 @@ def stack(observations: Sequence[Observation], wavelengths: Sequence[float], mes
         signs = jnp.asarray([[1, 1], [1, -1], [-1, 1], [-1, -1]], first.dtype)[..., None]
         directions = directions + signs[:, 0] * first + signs[:, 1] * second
         directions = directions / jnp.linalg.norm(directions, axis=-1, keepdims=True)
+    seeing = [observation.bands.response for observation in observations if observation.bands is not None]
+    nuisances = gather(observations, wavelengths)[1]
+    components = [OFFSETS[n] for n in nuisances.moving if SHADING.start <= n < SHADING.stop]
+    shaded = [
+        np.stack([shading(o, *component) for component in components], axis=-1)
+        if components
+        else np.zeros((*o.image.shape, 0), np.float32)
+        for o in observations
+    ]
     cameras = tuple(None if observation.focal == FIXED else observation.camera for observation in observations)
     return Batch(
         altitude=number([observation.altitude for observation in observations]),
@@ -130,10 +157,30 @@ def stack(observations: Sequence[Observation], wavelengths: Sequence[float], mes
         noise=padded("noise", np.float32(0)),
         noise_shot=padded("noise_shot", np.float32(0)),
         noise_floor=padded("noise_floor", np.float32(1)),
+        shading=padded(shaded, np.float32(0)),
         exposure_value=number([observation.exposure_value for observation in observations]),
-        nuisances=gather(observations, wavelengths)[1],
+        nuisances=nuisances,
         sun_axes=number(np.stack([sun_axes(observation.sun) for observation in observations])),
         cameras=cameras if any(cameras) else (),
+        response=number(np.stack(seeing)) if seeing else None,
         tiles=tiles,
         mesh=mesh,
     )
+
+
+def _check_channels(observation: Observation, first: Observation, wavelengths: Sequence[float]) -> None:
+    """Refuse an image whose channels are neither the wavelengths nor bands of them, or are unlike those of the ``first``."""
+    given, bands = ", ".join(f"{nm:g}" for nm in wavelengths), observation.bands
+    channels = observation.image.shape[-1]
+    if (bands is None) != (first.bands is None):
+        raise FitError(f"{observation.name}: bands: expected all images to have them, or none")
+    if channels != first.image.shape[-1]:
+        raise FitError(f"{observation.name}: the image has {channels} channels, {first.name} {first.image.shape[-1]}")
+    if bands is None and channels != len(wavelengths):
+        raise FitError(
+            f"{observation.name}: the image has {channels} channels, expected {len(wavelengths)}, one for each "
+            f"wavelength of the atmosphere ({given} nm)"
+        )
+    if bands is not None and not (len(bands.nodes) == len(wavelengths) and np.allclose(bands.nodes, wavelengths)):
+        nodes = ", ".join(f"{nm:g}" for nm in bands.nodes)
+        raise FitError(f"{observation.name}: bands: they are of {nodes} nm, the atmosphere has {given} nm")

@@ -17,6 +17,7 @@ from matplotlib.ticker import MaxNLocator
 
 from diffatmo import color
 from fitting.findings import NINETY_FIVE, ONE_SIGMA, Findings, Profile
+from fitting.nuisances import channels
 from fitting.observation import Observation
 
 Image = Float[np.ndarray, "height width w"]
@@ -44,7 +45,7 @@ def developed(
     observation: Observation, fitted: Image, wavelengths: Sequence[float]
 ) -> tuple[Float[np.ndarray, "height width 3"], Float[np.ndarray, "height width 3"]]:
     """The measured and the fitted image for a screen, through the same exposure and tone curve."""
-    bands = jnp.asarray(wavelengths)
+    bands = jnp.asarray(wavelengths if observation.bands is None else observation.bands.centres)
     # In the shape of the image, whatever pixels are used, so that images of one size share one compiled program.
     used = jnp.asarray(np.where(observation.used[..., None], observation.image, np.nan))
     exposure = color.auto_exposure(color.to_linear_srgb(used, wavelengths=bands))
@@ -79,23 +80,25 @@ def bare(axes: Axes, title: str) -> None:
 def image_figure(
     observation: Observation, fitted: Image, residual: Image, wavelengths: Sequence[float], scale: float
 ) -> Figure:
-    """Measured and fitted side by side, and below them the relative residual of each wavelength (if up to three)."""
-    channels = {f"residual at {nm:g} nm": residual[..., i] for i, nm in enumerate(wavelengths)}
-    if len(channels) > 3:
-        channels = {"residual, mean of all wavelengths": np.mean(residual, axis=-1)}
+    """Measured and fitted side by side, and below them the relative residual of each channel (if up to three)."""
+    names = channels(observation, wavelengths)
+    unit = " nm" if observation.bands is None else ""
+    panels = {f"residual, {name}{unit}": residual[..., i] for i, name in enumerate(names)}
+    if len(panels) > 3:
+        panels = {"residual, mean of all channels": np.mean(residual, axis=-1)}
     height, width = observation.used.shape
-    rows = [height / width / 2, height / width / max(len(channels), 2)]
+    rows = [height / width / 2, height / width / max(len(panels), 2)]
     figure = Sheet(figsize=(10, 10 * sum(rows) + 1.1), layout="constrained")
     above, below = figure.subfigures(2, 1, height_ratios=rows, squeeze=False)[:, 0]
     pictures = developed(observation, fitted, wavelengths)
     for axes, picture, title in zip(above.subplots(1, 2), pictures, ("measured", "fitted"), strict=True):
         axes.imshow(picture, interpolation="nearest")
         bare(axes, title)
-    panels = np.atleast_1d(below.subplots(1, len(channels)))
-    for axes, (title, values) in zip(panels, channels.items(), strict=True):
+    drawn = np.atleast_1d(below.subplots(1, len(panels)))
+    for axes, (title, values) in zip(drawn, panels.items(), strict=True):
         axes.imshow(diverging(values, scale), interpolation="nearest")
         bare(axes, title)
-    _residual_bar(below, list(panels), scale)
+    _residual_bar(below, list(drawn), scale)
     return figure
 
 
@@ -108,7 +111,7 @@ def _residual_bar(figure: FigureBase, axes: list[Axes], scale: float) -> None:
 
 
 def overview_figure(result: Findings) -> Figure:
-    """A row for every image: measured, fitted, and the relative residual, mean of all wavelengths."""
+    """A row for every image: measured, fitted, and the relative residual, mean of all channels."""
     wavelengths = [float(nm) for nm in result.atmosphere.wavelengths]
     scale, residuals = residual_scale(result.residuals), result.residuals
     heights = [observation.used.shape[0] / observation.used.shape[1] for observation in result.observations]

@@ -28,7 +28,7 @@ def slopes(
     y: Coordinates, columns: Float[np.ndarray, "image w row k"], problem: Problem
 ) -> Float[np.ndarray, "image w row n"]:
     """Derivatives of the residuals with respect to ``y``, from columns as those of :attr:`Linearisation.rows`."""
-    colour, channel = problem.parameters.colours()
+    colour, channel = problem.colours()
     nuisances = problem.batch.nuisances
     exposure = _exposure(y, problem)[..., None]
     tangents, lit, one = columns[..., :-3], exposure * columns[..., -3:-2], columns[..., -2:-1]

@@ -1,7 +1,8 @@
 """The costly part of a fit: the model and its forward derivatives in all pixels, reduced to a few rows for each image.
 
 *Colours.* Wavelengths do not mix, so all numbers of a spectral parameter share one tangent, whose
-channel w is the derivative with respect to number w alone. Images do not mix either, so a component of an offset shares one
+channel w is the derivative with respect to number w alone (channels that are bands do mix them: then each number has a tangent
+of its own). Images do not mix either, so a component of an offset shares one
 tangent among all images, and the sky stays as it is along it. Exposures and pedestals need no tangent at all. Nine parameters
 at three wavelengths thus cost as many forward derivatives as there are *fields*, not numbers.
 
@@ -31,7 +32,7 @@ from jaxtyping import Array, Float, Int
 from diffatmo.atmosphere import Atmosphere
 from diffatmo.models import Sky
 from fitting.batch import PIXEL_FIELDS, Views
-from fitting.nuisances import AEROSOL
+from fitting.nuisances import AEROSOL, SHADING
 from fitting.parameters import Coordinates
 from fitting.problem import Linear, Predicted, Problem, hazier, seen
 
@@ -117,7 +118,7 @@ def _linearise(x: Coordinates, linear: Linear, problem: Problem) -> Linearisatio
         bad = bad + jnp.sum(used & jnp.stack(lost, axis=-1), axis=0)
         return (rows, beyond, pushes, bad), radiance
 
-    colours = int(problem.parameters.colours()[0].max()) + 1 + len(batch.nuisances.moving)
+    colours = int(problem.colours()[0].max()) + 1 + len(batch.nuisances.moving)
     channels, size, dtype = batch.measured.shape[-1], colours + 3, batch.measured.dtype
     forms = 0 if problem.fields is None else problem.fields.coefficient.shape[-1]
     empty = (
@@ -163,18 +164,20 @@ def visit(
     """
     batch = problem.batch
     coordinates, moved = problem.parts(x)
-    colour, _ = problem.parameters.colours()
+    colour, _ = problem.colours()
     seeds = jnp.asarray(colour == np.arange(colour.max() + 1)[:, None], dtype=coordinates.dtype)
     air, of_air = _push(problem.parameters.atmosphere, (coordinates,), (seeds,))
-    # The tangents of a free aerosol come last, as it does among the offsets.
+    # What moves the view comes first among the offsets, shading next, and last a free aerosol.
     apart = AEROSOL in batch.nuisances.moving
-    turning = len(batch.nuisances.moving) - apart
+    turning = sum(component < SHADING.start for component in batch.nuisances.moving)
     each = jnp.broadcast_to(jnp.eye(turning, moved.shape[1], dtype=moved.dtype)[:, None], (turning, *moved.shape))
     views, of_views = _push(batch.views, (moved,), (each,)) if turning else (batch.views(moved), None)
     sky, of_sky = (None, None) if apart else _push(problem.sky, (air,), (of_air,))
-    tiled = lambda values: values.reshape(len(values), batch.tiles, -1, *values.shape[2:])
+    tiled = lambda values: values.reshape(len(values), batch.tiles, values.shape[1] // batch.tiles, *values.shape[2:])
     pixels = {name: tiled(getattr(batch, name)) for name in PIXEL_FIELDS if name != "directions"}
     pixels |= {"weight": tiled(problem.weight), "directions": tiled(views.directions)}
+    if shaded := batch.shading.shape[-1]:
+        pixels["modulation"] = tiled(batch.modulation(moved))
     if problem.correction is not None:
         pixels["correction"] = tiled(problem.correction)
     if of_views is not None:
@@ -195,14 +198,19 @@ def visit(
 
         def of_tile(carry: Any, tile: Tile) -> tuple[Any, Any]:
             directions = tile["directions"]
-            light, tangents = _push(lambda view: seen(view, directions), (view,), (of_view,))
+            light, tangents = _push(lambda view: seen(view, directions, here.response), (view,), (of_view,))
             if tangents is None:
                 # A model that makes no use of what is free.
                 tangents = jnp.zeros((len(seeds) + apart, *light.shape), light.dtype)
             if displaced is not None:
-                _, turns = _push(seen, (view, directions), (displaced, tile["turned"]))
+                look_at = lambda view, directions: seen(view, directions, here.response)
+                _, turns = _push(look_at, (view, directions), (displaced, tile["turned"]))
                 tangents = jnp.concatenate([tangents[: len(seeds)], turns, tangents[len(seeds) :]])
             tangents = jnp.moveaxis(tangents, 0, -1)
+            if shaded:
+                before, after = jnp.split(tangents, [tangents.shape[-1] - apart], axis=-1)
+                tangents = jnp.concatenate([before, light[..., None] * tile["shading"], after], axis=-1)
+                light, tangents = light * tile["modulation"], tangents * tile["modulation"][..., None]
             if "correction" in tile:
                 light, tangents = light * tile["correction"], tangents * tile["correction"][..., None]
             return add(carry, tile | own | {"radiance": light, "tangents": tangents})

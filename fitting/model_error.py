@@ -46,6 +46,8 @@ def _correction(x: Coordinates, problem: Problem, radiance: Predicted, finer: Mo
     coordinates, moved = problem.parts(x)
     batch = problem.batch
     wanted = predict(finer.sky, problem.parameters.atmosphere(coordinates), batch.views(moved), batch.tiles)
+    if batch.shading.shape[-1]:
+        wanted = wanted * batch.modulation(moved)
     known = batch.used[..., None] & (radiance > 0) & (wanted > 0)
     ratio = wanted / jnp.where(known, radiance, 1)
     return jnp.where(known, jnp.clip(ratio, 1 / LARGEST_CORRECTION, LARGEST_CORRECTION), 1)

@@ -9,6 +9,8 @@ kind                numbers                                                enter
 ``sun_offset``      two angles in the tangent plane of the sun             the sun                                     0 ± 0.5°
 ``pose``            three components of a rotation vector                  the directions of the pixels                0 ± 2°
 ``focal``           the logarithm of a factor                              the directions, by the camera's projection  0 ± 5 %
+``vignetting``      two coefficients v, of ρ² and ρ⁴                       light × exp(Σ v ρ^k)                        0 ± 0.5
+``tone``            three coefficients of what a pixel itself says         light × exp(Σ t φ(pixel))                   0 ± 0.15
 ``aerosol``         the logarithm of a factor                              the aerosol of this image                   0 ± 30 %
 ==================  =====================================================  ==========================================  ======
 
@@ -16,8 +18,9 @@ Each is fixed, free for an image of its own, or shared by a named group of image
 
 The first three are *linear*: given the radiance, their optimum follows (:mod:`fitting.elimination`). The others are *offsets*:
 they move the view of a sky that is solved once, but for the aerosol, with which every image has a sky of its own. An offset
-touches one image, or those of its group, and images do not mix; so the seven components of :data:`OFFSETS` need seven tangents
-at most, whatever the number of images.
+touches one image, or those of its group, and images do not mix; so the components of :data:`OFFSETS` need as many tangents
+at most, whatever the number of images. Those of *shading*, vignetting and tone, cost none: the logarithm of the light is linear
+in them, with the columns of :func:`shading`.
 
 *Time series.* The logarithms a of the aerosols of images at the times t are a stationary Ornstein-Uhlenbeck process, the
 continuous autoregression of first order: ⟨a a'⟩ = σ² exp(-|t - t'| / T). It is Markovian, so what is known beforehand are
@@ -36,7 +39,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from diffatmo._types import Direction
 from diffatmo.numerics import safe_norm
@@ -50,14 +53,23 @@ OFFSETS = (
     ("pose", "north_deg"),
     ("pose", "up_deg"),
     ("focal", ""),
+    ("vignetting", "2"),
+    ("vignetting", "4"),
+    ("tone", "1"),
+    ("tone", "2"),
+    ("tone", "3"),
     ("aerosol", ""),
 )
 """Kind and component of all offsets of an image."""
 
-SUN, POSE, FOCAL, AEROSOL = slice(0, 2), slice(2, 5), 5, 6
+SUN, POSE, FOCAL, SHADING, AEROSOL = slice(0, 2), slice(2, 5), 5, slice(6, 11), 11
 """Their places among the offsets of an image."""
 
-KINDS = ("exposure", "white_balance", "pedestal", "sun_offset", "pose", "focal", "aerosol")
+KINDS = ("exposure", "white_balance", "pedestal", "sun_offset", "pose", "focal", "vignetting", "tone", "aerosol")
+
+
+DARKEST = 1e-3
+"""Pixel over white below which a tone curve is not known to bend any further."""
 
 
 class Label(NamedTuple):
@@ -80,7 +92,8 @@ class Nuisances(eqx.Module):
     """rad, or of a logarithm."""
     innovation: Float[Array, "m m"]
     """From the offsets, in their units, to what is known beforehand to be independent and 0 ± 1."""
-    angle: Bool[Array, " m"]
+    per_unit: Float[Array, " m"]
+    """What an offset is multiplied by to be reported; 0 for one that is the logarithm of what is reported."""
     factor_index: Int[Array, "image w 2"]
     """Numbers of the factors of exposure and of white balance."""
     pedestal_index: Int[Array, "image w"]
@@ -118,7 +131,8 @@ class Nuisances(eqx.Module):
     def values(self, coordinates: Float[Array, " m+k"]) -> Float[Array, " m+k"]:
         """The numbers that are reported: degrees, factors, and units of the image."""
         offsets, linear = coordinates[: self.offsets] * self.unit, coordinates[self.offsets :]
-        reported = jnp.where(self.angle, offsets * (180 / math.pi), jnp.exp(jnp.where(self.angle, 0, offsets)))
+        logarithm = self.per_unit == 0
+        reported = jnp.where(logarithm, jnp.exp(jnp.where(logarithm, offsets, 0)), offsets * self.per_unit)
         return jnp.concatenate([reported, jnp.exp(linear[: self.factors]), linear[self.factors :]])
 
 
@@ -131,16 +145,22 @@ def group_of(observation: Observation, kind: str) -> str | None:
     return observation.name if group == FREE else group
 
 
+def channels(observation: Observation, wavelengths: Sequence[float]) -> list[str]:
+    """What the channels of an image are called: their bands, or their wavelengths in nm."""
+    return [f"{nm:g}" for nm in wavelengths] if observation.bands is None else list(observation.bands.names)
+
+
 def channel_names(observation: Observation, kind: str, wavelengths: Sequence[float]) -> list[str | None]:
     """For each channel the name of its exposure, white balance or pedestal; None where that is fixed."""
-    group = group_of(observation, kind)
+    group, bands = group_of(observation, kind), observation.bands
+    centres = np.asarray(wavelengths if bands is None else bands.centres)
     if group is None:
-        return [None] * len(wavelengths)
-    names: list[str | None] = [f"{kind}_{group}_{nm:g}" for nm in wavelengths]
+        return [None] * centres.size
+    names: list[str | None] = [f"{kind}_{group}_{name}" for name in channels(observation, wavelengths)]
     if kind == "white_balance":
-        names[int(np.argsort(wavelengths)[(len(wavelengths) - 1) // 2])] = None
+        names[int(np.argsort(centres)[(centres.size - 1) // 2])] = None
     elif not getattr(observation, kind).endswith(PER_CHANNEL):
-        names = [f"{kind}_{group}"] * len(wavelengths)
+        names = [f"{kind}_{group}"] * centres.size
     return names
 
 
@@ -155,7 +175,7 @@ def gather(observations: Sequence[Observation], wavelengths: Sequence[float]) ->
             if (group := group_of(observation, kind)) is None:
                 continue
             of_offsets[image, column] = offsets.number(f"{kind}_{group}" + f"_{component}" * bool(component))
-            error = getattr(observation, f"{kind}_error")
+            error = error_of(observation, kind, component)
             units[len(units) :] = [error] * (len(offsets) - len(units))
             if units[of_offsets[image, column]] != error:
                 raise FitError(
@@ -175,14 +195,19 @@ def gather(observations: Sequence[Observation], wavelengths: Sequence[float]) ->
         [[pedestals.number(name) for name in channel_names(o, "pedestal", wavelengths)] for o in observations]
     )
     moving = np.flatnonzero((of_offsets >= 0).any(axis=0))
-    angle = [name.endswith("_deg") and not name.startswith(("focal_", "aerosol_")) for name in offsets]
-    labels = [Label(name, "deg" if is_angle else "") for name, is_angle in zip(offsets, angle, strict=True)]
+    scales = [
+        1.0 if name.startswith(("vignetting_", "tone_")) else 180 / math.pi * name.endswith("_deg") for name in offsets
+    ]
+    scales = [
+        0.0 if name.startswith(("focal_", "aerosol_")) else scale for name, scale in zip(offsets, scales, strict=True)
+    ]
+    labels = [Label(name, "deg" if scale > 1 else "") for name, scale in zip(offsets, scales, strict=True)]
     return [*labels, *map(Label, [*factors, *pedestals])], Nuisances(
         moving=tuple(int(component) for component in moving),
         offset_index=jnp.asarray(of_offsets[:, moving]),
         unit=jnp.asarray(units, jnp.result_type(float)),
         innovation=jnp.asarray(_innovation(len(offsets), times, _memory(observations)), jnp.result_type(float)),
-        angle=jnp.asarray(angle, bool),
+        per_unit=jnp.asarray(scales, jnp.result_type(float)),
         factor_index=jnp.asarray(of_factors),
         pedestal_index=jnp.asarray(of_pedestals),
         factors=len(factors),
@@ -231,6 +256,29 @@ def _check_groups(observations: Sequence[Observation], kind: str) -> None:
         raise FitError(f"{both.pop()}: an image with a free {kind} has the name of a group; rename the group")
 
 
+def error_of(observation: Observation, kind: str, component: str) -> float:
+    """What is known of an offset beforehand, rad or of a logarithm."""
+    if (kind, component) == ("pose", "up_deg") and observation.heading_error is not None:
+        return observation.heading_error
+    error: float = getattr(observation, f"{kind}_error")
+    return error
+
+
+def shading(observation: Observation, kind: str, component: str) -> Float[np.ndarray, "height width w"]:
+    """What a coefficient of shading is multiplied by in the logarithm of the light; 0 where that image has none.
+
+    Of *vignetting*, powers of the distance ρ from the centre, in units of the half diagonal. Of *tone*, where the curve that
+    was undone may not have been the one that was applied: with u = ln(pixel / white), u, u²/3 and 2 pixel / white.
+    """
+    if group_of(observation, kind) is None:
+        return np.zeros_like(observation.image)
+    if kind == "vignetting":
+        return np.broadcast_to(observation.radius[..., None] ** int(component), observation.image.shape)
+    relative = np.nan_to_num(observation.image / observation.white, posinf=1.0, neginf=0.0)
+    logarithm = np.log(np.clip(relative, DARKEST, None))
+    return np.asarray({"1": logarithm, "2": logarithm**2 / 3, "3": 2 * relative}[component], dtype=np.float32)
+
+
 def assumed(observations: Sequence[Observation]) -> list[tuple[str, float, float, bool, str]]:
     """What is known of the offsets beforehand: name, value, error, whether it is one of the logarithm, and whose.
 
@@ -238,17 +286,14 @@ def assumed(observations: Sequence[Observation]) -> list[tuple[str, float, float
     """
     found: dict[tuple[str, float, float, bool, str], None] = {}
     for observation in observations:
-        for kind, unit in (("sun_offset", "_deg"), ("pose", "_deg"), ("focal", ""), ("aerosol", "")):
-            if group_of(observation, kind) is not None:
-                error = getattr(observation, f"{kind}_error")
-                in_degrees = bool(unit)
-                found[
-                    kind + unit,
-                    float(not in_degrees),
-                    math.degrees(error) if in_degrees else error,
-                    not in_degrees,
-                    "each",
-                ] = None
+        for kind, component in OFFSETS:
+            if group_of(observation, kind) is None:
+                continue
+            error, in_degrees = error_of(observation, kind, component), component.endswith("_deg")
+            factor = not component
+            heading = (kind, component) == ("pose", "up_deg") and observation.heading_error is not None
+            name = "pose_up_deg" if heading else kind + "_deg" * in_degrees
+            found[name, float(factor), math.degrees(error) if in_degrees else error, factor, "each"] = None
     return list(found)
 
 

@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from diffatmo.bands import Bands
 from diffatmo.camera import Camera, CameraError
 from fitting._errors import FitError
 
@@ -35,6 +36,8 @@ SUN_EXCLUSION = math.radians(2.0)
 SUN_OFFSET_ERROR = math.radians(0.5)
 POSE_ERROR = math.radians(2.0)
 FOCAL_ERROR = 0.05
+VIGNETTING_ERROR = 0.5
+TONE_ERROR = 0.15
 AEROSOL_ERROR = 0.3
 AEROSOL_MEMORY_H = 6.0
 
@@ -49,10 +52,15 @@ class Observation(eqx.Module):
     sun_offset: str = eqx.field(static=True)
     pose: str = eqx.field(static=True)
     focal: str = eqx.field(static=True)
+    vignetting: str = eqx.field(static=True)
+    tone: str = eqx.field(static=True)
     aerosol: str = eqx.field(static=True)
     sun_offset_error: float
     pose_error: float
+    heading_error: float | None
     focal_error: float
+    vignetting_error: float
+    tone_error: float
     aerosol_error: float
     aerosol_memory_h: float
     time_h: float | None
@@ -61,6 +69,10 @@ class Observation(eqx.Module):
     sun: Float[np.ndarray, "3"]
     image: Float[np.ndarray, "height width w"]
     directions: Float[np.ndarray, "height width 3"]
+    radius: Float[np.ndarray, "height width"]
+    """Distance from the centre of the picture, in units of its half diagonal."""
+    white: float
+    """The largest value a pixel can have, or has."""
     spread: Float[np.ndarray, "height width 2 3"]
     """Standard deviations of the directions that a pixel is the mean of, along their two axes; zero for a single one."""
     shown: Bool[np.ndarray, "height width"]
@@ -71,6 +83,8 @@ class Observation(eqx.Module):
     masked: dict[str, int] = eqx.field(static=True)
     block: int = eqx.field(static=True)
     camera: Camera
+    bands: Bands | None
+    """What its channels see of the spectrum; None if each is one of the atmosphere's wavelengths."""
 
 
 def observe(
@@ -93,15 +107,21 @@ def observe(
     sun_offset: str = FIXED,
     pose: str = FIXED,
     focal: str = FIXED,
+    vignetting: str = FIXED,
+    tone: str = FIXED,
     aerosol: str = FIXED,
     sun_offset_error: float = SUN_OFFSET_ERROR,
     pose_error: float = POSE_ERROR,
+    heading_error: float | None = None,
     focal_error: float = FOCAL_ERROR,
+    vignetting_error: float = VIGNETTING_ERROR,
+    tone_error: float = TONE_ERROR,
     aerosol_error: float = AEROSOL_ERROR,
     aerosol_memory_h: float = AEROSOL_MEMORY_H,
     time_h: float | None = None,
     exposure_value: float = 1.0,
     max_pixels: int = MAX_PIXELS,
+    bands: Bands | None = None,
     name: str = "image",
 ) -> Observation:
     """Prepare one image for fitting; raises :class:`FitError` for anything that cannot be right.
@@ -135,11 +155,20 @@ def observe(
             what hides them, must be left out: the edge has no derivative.
         focal: Whether the focal length may differ from the camera's, by a factor: ``"fixed"``, ``"free"``, or the name of a
             group. Not for equirectangular pictures, which have none.
+        vignetting: Whether the lens may darken the picture towards its corners: ``"fixed"``, ``"free"``, or the name of a group
+            that shares two coefficients, of the square and of the fourth power of the distance from the centre (1 in the
+            corners), in the logarithm of the light.
+        tone: Whether pixels may have been through another tone curve than the one that was undone: ``"fixed"``, ``"free"``, or
+            the name of a group that shares the three coefficients of a smooth curve. White is ``saturation``, or else the
+            brightest pixel.
         aerosol: Whether there may be more or less aerosol than the atmosphere's, by a factor: ``"fixed"``, ``"free"``, or the
             name of a group. Each such image costs the solution of a sky of its own.
         sun_offset_error: Standard deviation of each of the sun's two angles before the image is looked at, rad.
         pose_error: The same of each component of the rotation, rad.
+        heading_error: The same of the turn about the vertical, if that is less well known, as from a compass.
         focal_error: The same of the logarithm of the focal length.
+        vignetting_error: The same of each coefficient of the vignetting.
+        tone_error: The same of each coefficient of the tone curve.
         aerosol_error: The same of the logarithm of the factor of the aerosol.
         aerosol_memory_h: Hours in which the aerosol changes: factors of images taken Δt apart are correlated by
             exp(-Δt / ``aerosol_memory_h``).
@@ -148,6 +177,8 @@ def observe(
         exposure_value: The exposure as far as it is known: pixels = exposure_value × free factor × radiance.
         max_pixels: Average blocks of pixels until no more than this many are used. The model is averaged over four
             directions in each block.
+        bands: What the channels see of the spectrum; its nodes must be the wavelengths of the atmosphere, whose sun must have
+            the irradiance 1. None if every channel is one of the wavelengths.
         name: Of the image, in messages, tables and file names.
     """
     refuse = _Refusal(name)
@@ -157,6 +188,10 @@ def observe(
             f"pixels: got shape {image.shape} of {image.dtype}, expected numbers in the shape (height, width, channels)"
         )
     image = image.astype(np.float32)
+    if bands is not None and len(bands.names) != image.shape[-1]:
+        refuse(
+            f"bands: {len(bands.names)} of them ({', '.join(bands.names)}), but the image has {image.shape[-1]} channels"
+        )
     directions = np.asarray(camera.directions(), dtype=np.float32)
     if directions.shape[:2] != image.shape[:2]:
         size = "{1} x {0}".format(*directions.shape[:2])
@@ -185,16 +220,23 @@ def observe(
         ("sun_offset", sun_offset),
         ("pose", pose),
         ("focal", focal),
+        ("vignetting", vignetting),
+        ("tone", tone),
         ("aerosol", aerosol),
     ):
         refuse.unless(bool(value), key, repr(value), '"fixed", "free" or a name')
     for key, error in (
         ("sun_offset_error", sun_offset_error),
         ("pose_error", pose_error),
+        ("heading_error", heading_error),
         ("focal_error", focal_error),
+        ("vignetting_error", vignetting_error),
+        ("tone_error", tone_error),
         ("aerosol_error", aerosol_error),
     ):
-        radians = " rad" if key in ("sun_offset_error", "pose_error") else ""
+        if error is None:
+            continue
+        radians = " rad" if key in ("sun_offset_error", "pose_error", "heading_error") else ""
         refuse.unless(0 < error <= 1, key, error, f"more than 0 and at most 1{radians}")
     memory = aerosol_memory_h
     refuse.unless(memory > 0 and math.isfinite(memory), "aerosol_memory_h", memory, "a finite number of hours > 0")
@@ -249,6 +291,8 @@ def observe(
         refuse("noise: it is zero for some pixels, expected a standard deviation > 0")
     block = math.ceil(math.sqrt(used.sum() / max_pixels))
     fields: dict[str, Any] = {"image": image, "directions": directions, "shown": shown, "used": used, **noises}
+    fields["radius"] = _radius(*image.shape[:2])
+    white = float(np.max(image[used])) if saturation is None else float(saturation)
     single = np.zeros((*image.shape[:2], 2, 3), dtype=np.float32)
     return Observation(
         name=name,
@@ -258,10 +302,15 @@ def observe(
         sun_offset=sun_offset,
         pose=pose,
         focal=focal,
+        vignetting=vignetting,
+        tone=tone,
         aerosol=aerosol,
         sun_offset_error=float(sun_offset_error),
         pose_error=float(pose_error),
+        heading_error=None if heading_error is None else float(heading_error),
         focal_error=float(focal_error),
+        vignetting_error=float(vignetting_error),
+        tone_error=float(tone_error),
         aerosol_error=float(aerosol_error),
         aerosol_memory_h=float(aerosol_memory_h),
         time_h=None if time_h is None else float(time_h),
@@ -271,8 +320,16 @@ def observe(
         masked=dict(masked),
         block=block,
         camera=camera,
+        bands=bands,
+        white=max(white, 1e-30),
         **(fields | {"spread": single} if block == 1 else _bin(fields, block, raised=pedestal != FIXED)),
     )
+
+
+def _radius(height: int, width: int) -> Float[np.ndarray, "height width"]:
+    """Distance of every pixel from the centre of the picture, 1 in its corners."""
+    y, x = (2 * np.arange(size) + 1 - size for size in (height, width))
+    return (np.hypot(y[:, None], x) / math.hypot(height, width)).astype(np.float32)
 
 
 class _Refusal(NamedTuple):
@@ -336,8 +393,9 @@ def _bin(fields: dict[str, np.ndarray], block: int, *, raised: bool) -> dict[str
     count = np.maximum(chosen.sum((2, 3)), 1)
 
     def mean(key: str) -> np.ndarray:
-        finite = np.where(chosen[..., None], np.nan_to_num(split[key]), 0)
-        return finite.sum((2, 3), dtype=np.float64) / count[..., None]
+        alone = split[key].ndim == chosen.ndim
+        finite = np.where(chosen if alone else chosen[..., None], np.nan_to_num(split[key]), 0)
+        return finite.sum((2, 3), dtype=np.float64) / (count if alone else count[..., None])
 
     directions = mean("directions")
     apart = np.where(chosen[..., None], split["directions"] - directions[:, :, None, None], 0)
@@ -355,6 +413,7 @@ def _bin(fields: dict[str, np.ndarray], block: int, *, raised: bool) -> dict[str
     binned = {
         "image": mean("image"),
         "directions": directions,
+        "radius": mean("radius"),
         "spread": spread,
         "noise": relative,
         "noise_shot": mean("noise_shot") / count[..., None],

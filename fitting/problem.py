@@ -12,7 +12,8 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Float, Int
 
 from diffatmo.atmosphere import Atmosphere
 from diffatmo.models import Model, Moments, Sky
@@ -79,6 +80,16 @@ class Problem(eqx.Module):
         endless = jnp.full(self.batch.nuisances.offsets, jnp.inf, lower.dtype)
         return jnp.concatenate([lower, -endless]), jnp.concatenate([upper, endless])
 
+    def colours(self) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"]]:
+        """For each coordinate of the atmosphere the tangent it shares, and the one channel it touches, -1 for all of them.
+
+        Channels that are wavelengths do not mix. Channels that are bands see all wavelengths: no tangent is shared.
+        """
+        if self.batch.response is None:
+            return self.parameters.colours()
+        every = np.arange(self.parameters.size)
+        return every, np.full_like(every, -1)
+
     @property
     def known(self) -> bool:
         """Whether anything is known besides the images."""
@@ -93,9 +104,12 @@ def planet_shell(model: Model, parameters: Parameters) -> Any:
     return model.shell(bottom_radius=init.bottom_radius, top_altitude=init.top_altitude)
 
 
-def seen(view: View, directions: Float[Array, "pixel part 3"]) -> Float[Array, "pixel w"]:
-    """The radiance of pixels, the mean over their parts."""
-    return jnp.mean(view.radiance(view=directions).radiance, axis=1)
+def seen(
+    view: View, directions: Float[Array, "pixel part 3"], response: Float[Array, "channel w"] | None
+) -> Float[Array, "pixel channel"]:
+    """The radiance of pixels, the mean over their parts, as their channels see it."""
+    spectrum = jnp.mean(view.radiance(view=directions).radiance, axis=1)
+    return spectrum if response is None else jnp.matmul(spectrum, response.T, precision="highest")
 
 
 def hazier(atmosphere: Atmosphere, log_factor: Float[Array, ""] | None) -> Atmosphere:
@@ -120,11 +134,11 @@ def predict(make: Callable[[Atmosphere], Sky], atmosphere: Atmosphere, views: Vi
     shared = make(atmosphere) if views.aerosol is None else None
 
     def one(image: Views) -> Float[Array, "pixel w"]:
-        altitude, sun, directions, aerosol = image
+        altitude, sun, directions, aerosol, response = image
         sky = make(hazier(atmosphere, aerosol)) if shared is None else shared
         view = sky.view(altitude=altitude, sun=sun)
         tiled = directions.reshape(tiles, -1, *directions.shape[1:])
-        found = jax.lax.map(lambda tile: seen(view, tile), tiled)
+        found = jax.lax.map(lambda tile: seen(view, tile, response), tiled)
         return found.reshape(-1, found.shape[-1])
 
     return jax.lax.map(one, views)

@@ -42,6 +42,7 @@ from fitting.elimination import starting
 from fitting.evaluation import check_finite, corrected, evaluated, measured_light, pose, rescaled, weighed
 from fitting.least_squares import Factor, known_rows, reduce_images
 from fitting.linearisation import Linearisation, linearise
+from fitting.mixing import mixed
 from fitting.nuisances import Label, gather
 from fitting.observation import Observation, sigma
 from fitting.parameters import Coordinates, Parameters, select
@@ -67,7 +68,7 @@ PATIENCE = 40
 OTHERS = 3
 """Starts that are tried then, at most: fewer if one leads to a better χ² than that, or to the same minimum again."""
 
-CORRECTIONS, LEFT = 6, 0.5
+CORRECTIONS, LEFT, LARGEST_RATE = 8, 0.5, 0.95
 """How often the finer model is asked at most, and how many standard errors the optimum may have left to go without asking it
 again: in dense haze the model alone leads 75 of them astray, and its correction there is short by a quarter."""
 
@@ -328,20 +329,33 @@ def _noisier(a: Problem, b: Problem) -> float:
 
 def _refined(run: _Run, found: _Found, finer: Model) -> tuple[_Found, Float[np.ndarray, "n n"]]:
     """The optimum if the images are explained by ``finer`` there, and the covariance of what that may leave of errors."""
-    best, problem, light = found.best, found.problem, found.best.linearisation.radiance
+    best, problem, alone = found.best, found.problem, found.problem
+    here, light, on = best.y, best.linearisation.radiance, best.onward
+    places: list[np.ndarray] = []
+    images: list[np.ndarray] = []
     try:
         way = math.inf
         for _ in range(CORRECTIONS):
-            before, problem = best, corrected(best.y, light, found.problem, finer)
-            best = run.search(before.onward, problem, run.tolerance)
-            # Each way is shorter than the last by the same factor; the first by about what the correction grows along it.
-            last, way = way, _apart(before, best, problem)
-            rate = min(way / last if last < math.inf else GROWTH * float(model_error.deviation(problem).max()), 0.9)
+            problem = corrected(here, light, alone, finer)
+            best = run.search(on, problem, run.tolerance)
+            places.append(np.asarray(here, dtype=np.float64))
+            images.append(np.asarray(best.y, dtype=np.float64))
+            metric = best.triangle[:, :-1]
+            moves = [np.linalg.norm(metric @ (led - place)) for place, led in zip(places, images, strict=True)]
+            way = float(moves[-1])
+            # Where the optimum goes if it is moved: at first by about what the correction grows along the way.
+            rate = GROWTH * float(model_error.deviation(problem).max())
+            if len(moves) > 1:
+                apart = [np.linalg.norm(metric @ (both[-1] - both[-2])) for both in (images, places)]
+                rate = float(apart[0] / apart[1])
+            rate = min(rate, LARGEST_RATE)
             if not best.converged or way * rate / (1 - rate) < LEFT:
                 break
-            assert problem.correction is not None
-            # What the model alone says there.
-            light = best.linearisation.radiance / problem.correction
+            here = jnp.asarray(mixed(places, images, metric), best.y.dtype)
+            x, linear = problem.split(here)
+            here = jnp.concatenate([jnp.clip(x, *problem.limits), linear])
+            light = run.evaluate(*problem.split(here), alone).radiance
+            on = here
         else:
             best = best._replace(converged=False, message=RESTLESS.format(way))
     except KeyboardInterrupt:

@@ -23,6 +23,7 @@ import numpy as np
 
 from diffatmo import imageio
 from diffatmo.atmosphere import Atmosphere
+from diffatmo.bands import Bands
 from diffatmo.camera import PROJECTIONS
 from diffatmo.models import MODELS, Model
 from diffatmo.phase import PhaseTable
@@ -32,7 +33,7 @@ from fitting.observation import Observation
 from fitting.priors import Prior
 from fitting.search import Step
 
-SCHEMA, SCHEMA_VERSION = "diffatmo-result", 2
+SCHEMA, SCHEMA_VERSION = "diffatmo-result", 3
 
 RECORD = "record"
 
@@ -42,6 +43,7 @@ _CLASSES: dict[str, Callable[..., Any]] = {
     kind.__name__: kind
     for kind in (
         Atmosphere,
+        Bands,
         Estimate,
         Minimum,
         Observation,
