@@ -53,7 +53,9 @@ def decoding(what: str) -> Iterator[None]:
     except MemoryError as error:
         raise DamagedError(f"{what}: it asks for more memory than there is") from error
     except Exception as error:
-        line = next(iter(str(error).splitlines()), "") or type(error).__name__
+        said = error.args[0] if error.args else ""
+        text = said.decode("utf-8", "replace") if isinstance(said, bytes) else str(error)  # LibRaw's are bytes
+        line = next(iter(text.splitlines()), "") or type(error).__name__
         raise DamagedError(f"{what}: {line}") from error
 
 
