@@ -50,6 +50,8 @@ def decoding(what: str) -> Iterator[None]:
     try:
         with quiet(), warnings.catch_warnings(action="ignore"):
             yield
+    except Pillow.DecompressionBombError as error:
+        raise DamagedError(f"the header claims too many pixels: {error}") from error
     except MemoryError as error:
         raise DamagedError(f"{what}: it asks for more memory than there is") from error
     except Exception as error:

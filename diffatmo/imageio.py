@@ -32,8 +32,11 @@ from diffatmo.exif import Exif
 TRANSFERS = ("linear", "srgb")
 """Transfer functions that a caller may state."""
 
-MAX_PIXELS = 200_000_000
-"""Pictures with more pixels than this are refused before memory is asked for."""
+MAX_PIXELS = 160_000_000
+"""Pictures with more pixels than this are refused before memory is asked for; the largest sensors have 151 million."""
+
+SUSPECT_PIXELS, SUSPECT_RATIO = 2**26, 32
+"""So are those that have more than this and, in the file, less than one byte for so many pixels: decompression bombs."""
 
 MAX_BYTES = 12 * MAX_PIXELS
 """So are those whose channels take more than this, and files that are larger."""
@@ -74,17 +77,17 @@ def read_image(path: str | Path, *, transfer: str | None = None) -> Image:
     :class:`ImageError`.
     """
     path = Path(path)
+    name = str(path) if str(path).isprintable() else repr(str(path))
     if transfer not in (None, *TRANSFERS):
-        raise ImageError(f"{path}: transfer = {transfer!r}, expected {' or '.join(TRANSFERS)}")
+        raise ImageError(f"{name}: transfer = {transfer!r}, expected {' or '.join(TRANSFERS)}")
     try:
         image = _reader(path)(path, transfer)
     except OSError as error:
-        raise ImageError(f"{path}: cannot be read: {error.strerror or error}") from None
+        raise ImageError(f"{name}: cannot be read: {error.strerror or error}") from None
     except ValueError as error:
-        name = repr(str(path)) if "\0" in str(path) else path
         raise ImageError(f"{name}: {error}") from error
     if not np.isfinite(image.pixels).any():
-        raise ImageError(f"{path}: not one pixel is a finite number")
+        raise ImageError(f"{name}: not one pixel is a finite number")
     return image
 
 
@@ -107,7 +110,7 @@ def _reader(path: Path) -> "_Reader":
     raise ValueError("not an image of a known format, expected EXR, Radiance, PNG, TIFF, JPEG, HEIF or camera RAW")
 
 
-def _check_size(height: int, width: int, bytes_a_pixel: int = 12) -> None:
+def _check_size(path: Path, height: int, width: int, bytes_a_pixel: int = 12) -> None:
     if height < 1 or width < 1:
         raise ValueError(f"the picture has {width} x {height} pixels, expected at least one")
     if height * width > MAX_PIXELS:
@@ -115,6 +118,11 @@ def _check_size(height: int, width: int, bytes_a_pixel: int = 12) -> None:
     if height * width * bytes_a_pixel > MAX_BYTES:
         claim = f"{width} x {height} pixels of {bytes_a_pixel:,} bytes"
         raise ValueError(f"the header claims {claim}, more than the {MAX_BYTES:,} bytes that are accepted")
+    stored = path.stat().st_size
+    if height * width > max(SUSPECT_PIXELS, SUSPECT_RATIO * stored):
+        raise ValueError(
+            f"the header claims {width} x {height} pixels, and the file has {stored:,} bytes: not a photograph"
+        )
 
 
 def _linear(codes: np.ndarray, transfer: str | None, said: str | None, notes: Exif) -> Image:
@@ -156,7 +164,7 @@ def _read_exr(path: Path, transfer: str | None) -> Image:
     except (RuntimeError, ValueError, LookupError, MemoryError, TypeError):
         raise ValueError("the EXR header is damaged or cut short") from None
     (left, top), (right, bottom) = header["dataWindow"]
-    _check_size(int(bottom) - int(top) + 1, int(right) - int(left) + 1, 4 * channels)
+    _check_size(path, int(bottom) - int(top) + 1, int(right) - int(left) + 1, 4 * channels)
     if not np.array_equal(header["dataWindow"], header["displayWindow"]):
         raise ValueError("the EXR holds a crop (data window differs from display window), expected the whole picture")
     try:
@@ -165,6 +173,7 @@ def _read_exr(path: Path, transfer: str | None) -> Image:
             planes = {name: channel.pixels for name, channel in file.channels().items()} if count == 1 else {}
     except (RuntimeError, ValueError, LookupError, MemoryError, TypeError):
         count = 0
+    file = None  # which else keeps the planes
     if count == 0:
         raise ValueError("the EXR is cut short or damaged: not all pixels can be read")
     if count > 1:
@@ -221,13 +230,13 @@ def _channels(planes: Mapping[str, np.ndarray], listed: Attribute | None) -> tup
 def _read_radiance(path: Path, transfer: str | None) -> Image:
     _refuse_transfer(transfer)
     data = path.read_bytes()
-    _check_size(*codecs.radiance_size(data)[1:3])
+    _check_size(path, *codecs.radiance_size(data)[1:3])
     return Image(codecs.radiance(data), {}, None)
 
 
 def _read_png(path: Path, transfer: str | None) -> Image:
     parts = codecs.png_chunks(path.read_bytes())
-    _check_size(parts.height, parts.width)
+    _check_size(path, parts.height, parts.width)
     codes = codecs.png(parts)
     return _linear(codes[..., : 3 if parts.channels > 2 else 1], transfer, parts.transfer, exif.parse(parts.exif))
 
@@ -252,7 +261,7 @@ def _read_tiff(path: Path, transfer: str | None) -> Image:
             expected = math.prod(page.chunks) * itemsize
     except codecs.DamagedError:
         raise ValueError("the TIFF header is damaged or cut short") from None
-    _check_size(height, width, -(-size // max(1, height * width)))
+    _check_size(path, height, width, -(-size // max(1, height * width)))
     if axes not in ("YX", "YXS", "SYX"):
         raise ValueError(f"the TIFF has the axes {axes}, expected one picture")
     if compression not in _TIFF_COMPRESSIONS:
@@ -290,18 +299,24 @@ def _check_strips(path: Path, parts: list[tuple[int, int]], size: int, ratio: in
                 raise ValueError("the TIFF cannot be decoded: a strip holds more than its pixels")
 
 
+_JPEG_RATIO = 512
+"""Pixels in a byte at most: a block of 64 takes one bit or more, of its mean alone."""
+
 _SCANS_AT_MOST = 20 * MAX_PIXELS
 """Pixels times passes over the picture of a progressive JPEG; cameras make about ten passes."""
 
 
 def _read_jpeg(path: Path, transfer: str | None) -> Image:
-    with codecs.decoding("the JPEG is damaged"), Pillow.open(path, formats=("JPEG", "MPO")) as file:
+    with codecs.decoding("the JPEG is damaged"), Pillow.open(path, formats=("JPEG",)) as file:
         height, width, block = file.height, file.width, file.info.get("exif", b"")
-    _check_size(height, width)
-    scans = path.read_bytes().count(b"\xff\xda")
+    _check_size(path, height, width)
+    data = path.read_bytes()
+    if height * width > _JPEG_RATIO * len(data):
+        raise ValueError("the JPEG is damaged: the file ends before the last pixel")
+    scans = data.count(b"\xff\xda")
     if height * width * scans > _SCANS_AT_MOST and scans > 1:
         raise ValueError(f"the JPEG has {scans} scans of {width} x {height} pixels, which takes too long")
-    with codecs.decoding("the JPEG is damaged"), Pillow.open(path, formats=("JPEG", "MPO")) as file:
+    with codecs.decoding("the JPEG is damaged"), Pillow.open(path, formats=("JPEG",)) as file:
         codes = np.asarray(file if file.mode == "RGB" else file.convert("RGB"))
     return _linear(codes, transfer, None, exif.parse(block))
 
@@ -314,7 +329,7 @@ def _read_heif(path: Path, transfer: str | None) -> Image:
     with codecs.decoding("the HEIF is damaged"):
         file = pillow_heif.open_heif(path)
         (width, height), block = file.size, file.info.get("exif") or b""
-    _check_size(height, width)
+    _check_size(path, height, width)
     with codecs.decoding("the HEIF is damaged"):
         codes = np.atleast_3d(np.asarray(file))
         width = file.size[0]

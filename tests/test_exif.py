@@ -151,7 +151,9 @@ def test_damaged_blocks_never_raise_nor_lie():
     block = exif_block(FIRST, CAMERA, GPS)
     for end in range(len(block)):
         found = exif.parse(block[:end])
-        assert all(value in (None, true) for value, true in zip(found, EVERYTHING, strict=True) if not_text(value, true))
+        assert all(
+            value in (None, true) for value, true in zip(found, EVERYTHING, strict=True) if not_text(value, true)
+        )
     for byte in range(len(block)):
         for bit in range(8):
             found = exif.parse(block[:byte] + bytes([block[byte] ^ 1 << bit]) + block[byte + 1 :])

@@ -105,7 +105,7 @@ def test_linear_rgb_of_a_sensor_without_a_pattern(tmp_path):
     light = RNG.random((24, 32, 3))
     path = photographs.dng(tmp_path / "a.dng", np.round(light * WHITE).astype(np.uint16))
     pixels = imageio.read_image(path).pixels
-    # LibRaw halves the size, or not, as it likes; its integers have 16 bits.
+    # There is nothing to average. LibRaw's integers have 16 bits, the counts 12.
     assert pixels.shape == (24, 32, 3)
     np.testing.assert_allclose(pixels, light, atol=1 / WHITE)
 
@@ -116,7 +116,9 @@ def test_tiff_based_raw_is_told_from_a_tiff(tmp_path, counts):
     assert raw.is_raw(photographs.dng(tmp_path / "b.dng", counts, without=(0xC612,)).read_bytes())
     with tifffile.TiffWriter(tmp_path / "c.nef") as file:
         file.write(np.zeros((8, 8, 3), np.uint8), photometric="rgb", subifds=1)
-        file.write(counts, photometric=32803, extratags=[(0x828D, "H", 2, (2, 2), True), (0x828E, "B", 4, b"\0\1\1\2", True)])
+        file.write(
+            counts, photometric=32803, extratags=[(0x828D, "H", 2, (2, 2), True), (0x828E, "B", 4, b"\0\1\1\2", True)]
+        )
     assert raw.is_raw((tmp_path / "c.nef").read_bytes())
     tifffile.imwrite(tmp_path / "d.tif", counts)
     assert not raw.is_raw((tmp_path / "d.tif").read_bytes())
