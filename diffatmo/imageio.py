@@ -92,7 +92,10 @@ def read_image(path: str | Path, *, transfer: str | None = None) -> Image:
 
 
 def _reader(path: Path) -> "_Reader":
-    status = path.stat()
+    try:
+        status = path.stat()
+    except ValueError as error:
+        raise ValueError(f"not a file name: {error}") from None
     if stat.S_ISDIR(status.st_mode):
         raise ValueError("is a folder, expected an image file")
     if not stat.S_ISREG(status.st_mode):

@@ -64,7 +64,7 @@ def test_a_real_photograph(shared):
 
 
 def without(*tags):
-    return {tag: None for tag in tags}
+    return dict.fromkeys(tags)
 
 
 def times(camera=None, gps=None):
