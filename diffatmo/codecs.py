@@ -99,47 +99,44 @@ def radiance(data: bytes) -> np.ndarray:
     # A row has a mark of four bytes, then two for every 127 pixels of each channel.
     if len(data) - position < height * (4 + 8 * -(-width // 127) if compressed else 4 * width):
         raise ValueError(_TRUNCATED)
+    # The format drops the fraction of the mantissa, so the middle of its interval is meant; exponent 0 is black.
+    unit = np.ldexp(np.float32(1), np.arange(256) - 136)
+    unit[0] = 0
     divisor = factor.astype(np.float32)
     pixels = np.empty((height, width, 3), np.float32)
-    codes = np.empty((width, 4), np.uint8)
     for row in pixels:
         if compressed:
             if data[position : position + 4] != b"\x02\x02" + struct.pack(">H", width):
                 raise ValueError(_TRUNCATED if len(data) < position + 4 else "a row does not start where it should")
-            position = _run_lengths(data, position + 4, codes)
+            components, position = _run_lengths(data, position + 4, width)
+            codes = np.frombuffer(components, np.uint8).reshape(4, width).T
         else:
             codes = np.frombuffer(data, np.uint8, 4 * width, position).reshape(width, 4)
             position += 4 * width
-        # The format drops the fraction of the mantissa, so the middle of its interval is meant; exponent 0 is black.
-        mantissa, exponent = codes[:, :3].astype(np.float32), codes[:, 3:].astype(np.int32)
-        row[:] = np.where(exponent > 0, np.ldexp(mantissa + 0.5, exponent - 136), 0) / divisor
+        row[:] = (codes[:, :3] + np.float32(0.5)) * unit[codes[:, 3:]] / divisor
     return pixels
 
 
-def _run_lengths(data: bytes, position: int, row: np.ndarray) -> int:
-    """Decode one row, component after component, and return where the next one starts."""
-    width = len(row)
-    for channel in range(4):
-        x = 0
-        while x < width:
+def _run_lengths(data: bytes, position: int, width: int) -> tuple[bytearray, int]:
+    """Decode one row, component after component; and where the next one starts."""
+    row = bytearray()
+    for end in range(width, 4 * width + 1, width):
+        while len(row) < end:
             if position + 1 >= len(data):
                 raise ValueError(_TRUNCATED)
             count = data[position]
-            repeat = count > 128
-            count -= 128 if repeat else 0
-            if count == 0 or x + count > width:
-                raise ValueError("a run of pixels goes past the end of its row")
-            if repeat:
-                row[x : x + count, channel] = data[position + 1]
+            if count > 128:
+                count -= 128
+                row += data[position + 1 : position + 2] * count
                 position += 2
             else:
-                values = np.frombuffer(data[position + 1 : position + 1 + count], np.uint8)
-                if values.size < count:
-                    raise ValueError(_TRUNCATED)
-                row[x : x + count, channel] = values
+                row += data[position + 1 : position + 1 + count]
                 position += 1 + count
-            x += count
-    return position
+            if position > len(data):
+                raise ValueError(_TRUNCATED)
+            if count == 0 or len(row) > end:
+                raise ValueError("a run of pixels goes past the end of its row")
+    return row, position
 
 
 class Png(NamedTuple):
