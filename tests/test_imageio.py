@@ -1,15 +1,20 @@
 """Pictures in and out: exact round trips, and one clear line for every broken file."""
 
+import os
 import struct
+import sys
 import zlib
+from datetime import UTC, datetime
 
 import numpy as np
 import OpenEXR
+import photographs
 import pytest
 import tifffile
 from PIL import Image as Pillow
 
-from diffatmo import codecs, imageio
+from diffatmo import codecs, exif, imageio
+from diffatmo.exif import Exif
 from diffatmo.imageio import ImageError
 
 RNG = np.random.default_rng(0)
@@ -257,6 +262,77 @@ def test_tiff_with_floats(tmp_path, pixels):
         imageio.read_image(tmp_path / "p.tif")
 
 
+def test_tiff_of_unread_kinds(tmp_path):
+    plain, encoded = (struct.pack("<HHII", 259, 3, 1, compression) for compression in (1, 7))
+    assert plain in tiff_bytes(tmp_path)
+    (tmp_path / "a.tif").write_bytes(tiff_bytes(tmp_path).replace(plain, encoded))
+    with pytest.raises(ImageError, match="the compression 7, expected none, deflate, LZW or PackBits"):
+        imageio.read_image(tmp_path / "a.tif")
+
+
+# --- Photographs
+
+TALL = RNG.integers(0, 65536, (9, 6, 3), dtype=np.uint16)
+"""Each pixel differs, and so do height and width."""
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_pictures_are_turned_the_right_way_up(tmp_path, orientation):
+    first = {**photographs.FIRST, 0x112: ("H", [orientation])}
+    block = photographs.exif_block(first, photographs.CAMERA, photographs.GPS)
+    (tmp_path / "a.png").write_bytes(png_file(TALL, extra=png_chunk(b"eXIf", block[6:])))
+    tifffile.imwrite(tmp_path / "a.tif", TALL, photometric="rgb", extratags=[(0x112, "H", 1, orientation, True)])
+    expected = exif.upright(TALL, orientation) / 65535
+    for name in ("a.png", "a.tif"):
+        image = imageio.read_image(tmp_path / name)
+        np.testing.assert_allclose(image.pixels, expected, atol=1e-7)
+        assert image.pixels.flags.c_contiguous
+        assert (image.exif.orientation, image.exif.size) == (1, expected.shape[:2])
+    # A smooth ramp, which the lossy formats keep to three codes.
+    ramp = np.broadcast_to(np.linspace(0, 255, 32 * 48).reshape(32, 48, 1), (32, 48, 3)).astype(np.uint8)
+    photographs.jpeg(tmp_path / "a.jpg", ramp, block)
+    photographs.heif(tmp_path / "a.heic", ramp, block)
+    expected = exif.upright(ramp, orientation) / 255
+    for name in ("a.jpg", "a.heic"):
+        image = imageio.read_image(tmp_path / name, transfer="linear")
+        np.testing.assert_allclose(image.pixels, expected, atol=3 / 255)
+        assert (image.exif.orientation, image.exif.size) == (1, expected.shape[:2])
+        assert (image.exif.model, image.exif.iso) == ("A camera", 200)
+
+
+def test_what_is_read_besides_the_pixels(tmp_path, pixels):
+    imageio.write_exr(tmp_path / "a.exr", pixels)
+    image = imageio.read_image(tmp_path / "a.exr")
+    assert (image.exif, image.to_xyz, image.white_balance, image.saturation) == (Exif(), None, None, None)
+    tifffile.imwrite(tmp_path / "a.tif", pixels, photometric="rgb")
+    assert imageio.read_image(tmp_path / "a.tif").saturation is None
+    image = imageio.read_image(photographs.jpeg(tmp_path / "a.jpg", np.zeros((4, 5, 3), np.uint8)), transfer="srgb")
+    assert image.exif == Exif(size=(4, 5))
+    assert image.saturation == 1
+
+
+def test_real_photograph(shared):
+    path = next((shared / "real_sky").glob("helsinki_*.jpg"))
+    image = imageio.read_image(path, transfer="srgb")
+    assert image.pixels.shape == (1976, 4608, 3)
+    assert image.exif.size == (1976, 4608)
+    assert image.exif.time == datetime(2022, 8, 14, 11, 12, 31, tzinfo=UTC)
+    assert exif.fov_deg(image.exif) is None  # no equivalent of its focal length
+    red, green, blue = image.pixels[:200].mean((0, 1))
+    assert blue > green > red
+
+
+def test_heif_needs_its_transfer_function_and_its_library(tmp_path, monkeypatch):
+    path = photographs.heif(tmp_path / "a.heic", np.full((64, 64, 3), 128, np.uint8))
+    with pytest.raises(ImageError, match='state transfer = "srgb"'):
+        imageio.read_image(path)
+    value = ((128 / 255 + 0.055) / 1.055) ** 2.4
+    np.testing.assert_allclose(imageio.read_image(path, transfer="srgb").pixels, value, rtol=1e-5)
+    monkeypatch.setitem(sys.modules, "pillow_heif", None)
+    with pytest.raises(ImageError, match=r"a\.heic: HEIF needs pillow-heif: pip install 'diffatmo\[heif\]'$"):
+        imageio.read_image(path, transfer="srgb")
+
+
 # --- Writing
 
 
@@ -410,6 +486,11 @@ def test_unreadable_paths(tmp_path):
         imageio.read_image(tmp_path / "nothing.exr")
     with pytest.raises(ImageError, match="is a folder"):
         imageio.read_image(tmp_path)
+    with pytest.raises(ImageError, match="is not a file"):
+        imageio.read_image(os.devnull)
+    (tmp_path / "two\nlines.exr").write_bytes(b"x")
+    with pytest.raises(ImageError, match=r"^'.*two\\nlines\.exr': not an image"):
+        imageio.read_image(tmp_path / "two\nlines.exr")
 
 
 def test_transfer_functions_that_cannot_be(tmp_path, pixels):
