@@ -7,19 +7,19 @@ What a renderer holds of an atmosphere is by definition what :func:`read` makes 
 import dataclasses
 import re
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from diffatmo.atmosphere import FILE_KEYS, Atmosphere, AtmosphereError
+from diffatmo.atmosphere import FILE_KEYS, Atmosphere
 from diffatmo.compiling import outermost
-from diffatmo.models import Moments
+from diffatmo.models import Model, Moments, RayMarch
 from diffatmo.numerics import gauss_legendre
 from diffatmo.phase import PhaseTable
 from diffatmo.presets import blender, bruneton, three_geospatial, unreal
-from diffatmo.presets.fields import RED_GREEN_BLUE, PresetError, arranged
+from diffatmo.presets.fields import RED_GREEN_BLUE, PresetError, Wavelengths, arranged
 
 SUN_ZENITHS_DEG = (30.0, 60.0, 85.0)
 ALTITUDE_KM = 0.1
@@ -31,57 +31,99 @@ class Target(NamedTuple):
     """A renderer's format."""
 
     dumps: Callable[[Atmosphere, str], str]
-    loads: Callable[[str, Float[np.ndarray, " w"]], Atmosphere]
+    loads: Callable[[str, Wavelengths], dict[str, Any]]
+    """The fields of an :class:`Atmosphere`."""
     title: str
     use: str
     """What to do with the file."""
     marks: str
     """What a text of this format contains, as a regular expression."""
     comment: str
-    fixed: str
-    """What becomes of a parameter that is not held."""
-    three: bool
-    """It has three channels, whose wavelengths it does not know."""
-    holds_sun: bool
+    why: Mapping[str, str]
+    """Why a field is not held, where there is more to say than that it is fixed."""
     beyond: str
     """What its own model of the sky adds to the differences stated."""
+    channels: bool = False
+    """It has three channels."""
+    says_wavelengths: bool = False
+    says_sun: bool = False
+    model: type[Model] = Moments
+    """What shows the effect of its losses; of Blender's old model, single scattering."""
 
 
-_BLENDER = "three densities, of air, aerosol and ozone, are all that can be set"
+_G = "that of the other phase function, for the same mean cosine"
+_DENSITIES = {
+    "rayleigh_scattering": "one density of air",
+    "mie_scattering": "one density of aerosol",
+    "mie_absorption": "one density of aerosol",
+    "ozone_absorption": "one density of ozone",
+}
+_RUN = "run it in the Python console or the text editor"
 
 TARGETS: Mapping[str, Target] = {
     "unreal": Target(
-        unreal.dumps, unreal.loads, "Unreal's SkyAtmosphere",
-        "copy the text, and paste it into a level; a level has one SkyAtmosphere",
-        r"SkyAtmosphereComponent", "//", "not within what the component holds", three=True, holds_sun=False,
-        beyond="light scattered more than once after Hillaire 2020",
+        unreal.dumps,
+        unreal.loads,
+        "Unreal's SkyAtmosphere",
+        "copy the text, and paste it into a level in place of its SkyAtmosphere",
+        r"SkyAtmosphereComponent",
+        "//",
+        {
+            "ground_albedo": "8 bits in sRGB",
+            "mie_g": f"from 0 to {unreal.LARGEST_G}; {_G}",
+            "rayleigh_scale_height": f"at least {unreal.LEAST_SCALE_HEIGHT} km",
+            "mie_scale_height": f"at least {unreal.LEAST_SCALE_HEIGHT} km",
+            "solar_irradiance": "that of the directional light, whose colour it is",
+        },
+        "light scattered more than once after Hillaire 2020",
+        channels=True,
     ),
     "blender": Target(
-        blender.dumps, blender.loads, "Blender's sky texture, Multiple Scattering (5.0 and later)",
-        "run it in the Python console or the text editor",
-        r"import bpy[\s\S]*MULTIPLE_SCATTERING", "#", _BLENDER, three=False, holds_sun=False,
-        beyond="four wavelengths; light scattered more than once by a fit to the Earth's clear air",
+        blender.dumps,
+        blender.loads,
+        "Blender's sky texture, Multiple Scattering (5.0 and later)",
+        _RUN,
+        r"import bpy[\s\S]*MULTIPLE_SCATTERING",
+        "#",
+        _DENSITIES,
+        "four wavelengths, and light scattered more than once as fitted to the Earth's clear air",
     ),
     "blender-nishita": Target(
-        blender.dumps_nishita, blender.loads_nishita,
+        blender.dumps_nishita,
+        blender.loads_nishita,
         "Blender's sky texture, Nishita (2.90 to 4.5) or Single Scattering (5.0)",
-        "run it in the Python console or the text editor",
-        r"import bpy[\s\S]*(NISHITA|SINGLE_SCATTERING)", "#", _BLENDER, three=False, holds_sun=False,
-        beyond="light scattered once only, and a black ground: too dark by a quarter to a half",
+        _RUN,
+        r"import bpy[\s\S]*(NISHITA|SINGLE_SCATTERING)",
+        "#",
+        _DENSITIES,
+        "its coarse integrals; that light is scattered once only is in them",
+        model=RayMarch,
     ),
     "three-geospatial": Target(
-        three_geospatial.dumps, three_geospatial.loads, "AtmosphereParameters of @takram/three-atmosphere",
-        "import { atmosphere } from it, and pass it to PrecomputedTexturesGenerator and the effects",
-        r"AtmosphereParameters", "//", "not a parameter", three=True, holds_sun=True,
-        beyond="Bruneton's tables",
+        three_geospatial.dumps,
+        three_geospatial.loads,
+        "AtmosphereParameters of @takram/three-atmosphere",
+        "import { atmosphere } from it, and pass it on to PrecomputedTexturesGenerator and the materials",
+        r"AtmosphereParameters",
+        "//",
+        {"mie_g": _G},
+        "Bruneton's tables",
+        channels=True,
+        says_sun=True,
     ),
     "bruneton": Target(
-        bruneton.dumps, bruneton.loads, "Bruneton's precomputed_atmospheric_scattering",
+        bruneton.dumps,
+        bruneton.loads,
+        "Bruneton's precomputed_atmospheric_scattering",
         "#include it, and pass its constants to the constructor of atmosphere::Model",
-        r"kRayleighScattering", "//", "not a parameter", three=False, holds_sun=True,
-        beyond="Bruneton's tables; the demo evaluates spectra at 680, 550 and 440 nm",
+        r"kRayleighScattering",
+        "//",
+        {"mie_g": _G},
+        "its tables, and that its demo evaluates spectra at 680, 550 and 440 nm",
+        says_wavelengths=True,
+        says_sun=True,
     ),
-}  # fmt: skip
+}
 
 
 class Loss(NamedTuple):
@@ -93,8 +135,18 @@ class Loss(NamedTuple):
     held: tuple[float, ...] | str
     why: str
 
+    @property
+    def before(self) -> str:
+        """What is given, as text."""
+        return _shown(self.given)
+
+    @property
+    def after(self) -> str:
+        """What is held, as text."""
+        return _shown(self.held)
+
     def __str__(self) -> str:
-        return f"{self.key}: {_shown(self.given)} -> {_shown(self.held)} ({self.why})"
+        return f"{self.key}: {self.before} -> {self.after} ({self.why})"
 
 
 class SkyLoss(NamedTuple):
@@ -106,12 +158,24 @@ class SkyLoss(NamedTuple):
     """By absolute value, with its sign."""
 
     def __str__(self) -> str:
-        sun = f"sky, sun at {self.sun_zenith_deg:g} deg from the zenith"
+        sun = f"sky, sun {self.sun_zenith_deg:g} degrees from the zenith"
         return f"{sun}: {100 * self.rms:.2g} % RMS, {100 * self.largest:+.2g} % at most"
 
 
 def _shown(value: tuple[float, ...] | str) -> str:
     return value if isinstance(value, str) else ", ".join(f"{item:.6g}" for item in value)
+
+
+def summary(target: str, lost: Sequence[Loss], skies: Sequence[SkyLoss]) -> list[str]:
+    """What becomes of the sky, in words."""
+    if not lost and not any(sky.rms for sky in skies):
+        return [f"All parameters are held as they are. Not counted: {_target(target).beyond}."]
+    return [*map(str, skies), f"Not counted: {_target(target).beyond}."]
+
+
+def remarks(target: str, lost: Sequence[Loss], skies: Sequence[SkyLoss]) -> list[str]:
+    """All of it, in words, for :func:`write`."""
+    return [*map(str, lost), *summary(target, lost, skies)]
 
 
 def _target(name: str) -> Target:
@@ -129,11 +193,14 @@ def write(atmosphere: Atmosphere, target: str, *, remarks: Sequence[str] = ()) -
     comments = [f"An atmosphere for {chosen.title}: {chosen.use}.", *remarks]
     lines = "".join(f"{chosen.comment} {line}\n" for line in comments)
     try:
-        return chosen.dumps(arranged(atmosphere, three=chosen.three), lines)
-    except PresetError:
-        raise
+        return chosen.dumps(arranged(atmosphere, three=chosen.channels), lines)
     except ValueError as error:
         raise PresetError(f"{target}: {error}") from error
+
+
+def target_of(text: str) -> str | None:
+    """The target whose preset ``text`` looks like, or None."""
+    return next((name for name, target in TARGETS.items() if re.search(target.marks, text)), None)
 
 
 def read(
@@ -144,28 +211,30 @@ def read(
     ``wavelengths``, nm, are those of the channels, red first, where the format does not say them (680, 550, 440); the solar
     irradiance is 1 where it is not said. Raises :class:`PresetError` naming ``source`` and the key.
     """
-    likely = next((name for name, entry in TARGETS.items() if re.search(entry.marks, text)), None)
-    chosen = target or likely
+    likely = target_of(text)
+    name = target or likely
     try:
-        if chosen is None:
+        if name is None:
             raise PresetError(f"not a preset that can be read; known are those of {', '.join(TARGETS)}")
-        entry = _target(chosen)
-        if not re.search(entry.marks, text):
-            raise PresetError(f"not a preset of {chosen}" + (f"; it looks like one of {likely}" if likely else ""))
+        chosen = _target(name)
+        if not re.search(chosen.marks, text):
+            raise PresetError(f"not a preset of {name}" + (f"; it looks like one of {likely}" if likely else ""))
+        if wavelengths is not None and chosen.says_wavelengths:
+            raise PresetError(f"wavelengths: given, but a preset of {name} says its own")
         channels = RED_GREEN_BLUE if wavelengths is None else tuple(wavelengths)
-        if entry.three and len(channels) != 3:
-            raise PresetError(f"wavelengths_nm: got {len(channels)}, expected three, for red, green and blue")
-        return entry.loads(text, np.asarray(channels))
-    except (PresetError, AtmosphereError) as error:
-        raise PresetError(f"{source}: {error}") from error
+        if chosen.channels and len(channels) != 3:
+            raise PresetError(f"wavelengths: got {len(channels)}, expected three, for red, green and blue")
+        return Atmosphere(**chosen.loads(text, np.asarray(channels)))
     except ValueError as error:
-        raise PresetError(f"{source}: cannot be read: {error}") from error
+        raise PresetError(f"{source}: {error}") from error
 
 
 def _given_and_held(atmosphere: Atmosphere, target: str) -> tuple[Atmosphere, Atmosphere]:
     """The atmosphere from red to blue, at the bands of the target; and what is left of it there."""
-    given = arranged(atmosphere, three=_target(target).three)
-    return given, read(write(given, target), target, wavelengths=np.asarray(given.wavelengths).tolist())
+    chosen = _target(target)
+    given = arranged(atmosphere, three=chosen.channels)
+    wavelengths = None if chosen.says_wavelengths else np.asarray(given.wavelengths).tolist()
+    return given, read(write(given, target), target, wavelengths=wavelengths)
 
 
 def losses(atmosphere: Atmosphere, target: str) -> list[Loss]:
@@ -173,33 +242,19 @@ def losses(atmosphere: Atmosphere, target: str) -> list[Loss]:
     chosen = _target(target)
     given, held = _given_and_held(atmosphere, target)
     found = []
-    wavelengths = _numbers(np.sort(np.asarray(atmosphere.wavelengths))[::-1])
-    if chosen.three and len(wavelengths) != 3:
-        why = "three channels: spectra are interpolated"
-        found.append(Loss("wavelengths_nm", wavelengths, RED_GREEN_BLUE, why))
-    elif not chosen.title.startswith("Bruneton") and wavelengths != RED_GREEN_BLUE:
-        found.append(Loss("wavelengths_nm", wavelengths, RED_GREEN_BLUE, "not said; what is read back is taken to be at these"))
+    wavelengths = tuple(sorted(_numbers(atmosphere.wavelengths), reverse=True))
+    if not chosen.says_wavelengths and wavelengths != RED_GREEN_BLUE:
+        interpolated = chosen.channels and len(wavelengths) != 3
+        why = "three channels, interpolated" if interpolated else "not said; read back as these unless told otherwise"
+        found.append(Loss(FILE_KEYS["wavelengths"], wavelengths, RED_GREEN_BLUE, why))
     for name, key in FILE_KEYS.items():
         before, after = getattr(given, name), getattr(held, name)
         if name == "mie_phase":
             if before != after:
-                shown = "a table" if isinstance(before, PhaseTable) else before
-                found.append(Loss(key, shown, str(after), "the mean cosine is kept"))
-        elif name == "wavelengths" or np.array_equal(before, after):
-            continue
-        elif name == "solar_irradiance" and not chosen.holds_sun:
-            found.append(Loss(key, _numbers(before), _numbers(after), "that of the renderer's own sun"))
-        else:
-            found.append(Loss(key, _numbers(before), _numbers(after), _why(chosen, name, given, held)))
+                found.append(Loss(key, "a table" if isinstance(before, PhaseTable) else before, str(after), "fixed"))
+        elif not np.array_equal(before, after):
+            found.append(Loss(key, _numbers(before), _numbers(after), chosen.why.get(name, "fixed")))
     return found
-
-
-def _why(target: Target, name: str, given: Atmosphere, held: Atmosphere) -> str:
-    if name == "mie_g" and given.mie_phase != held.mie_phase and not target.title.startswith("Blender"):
-        return "of the other phase function"
-    if name == "ground_albedo" and target.dumps is unreal.dumps:
-        return "8 bits in sRGB"
-    return target.fixed
 
 
 def _numbers(value: object) -> tuple[float, ...]:
@@ -209,25 +264,30 @@ def _numbers(value: object) -> tuple[float, ...]:
 def sky_losses(atmosphere: Atmosphere, target: str) -> list[SkyLoss]:
     """How the sky of what ``target`` holds differs from that of ``atmosphere``, at the target's bands.
 
-    Both by :class:`~diffatmo.models.Moments`, under the same sun, 100 m above the ground, at 100 directions from the zenith
-    to the horizon that weigh as solid angle; what the target's own model of the sky adds is not in it.
+    Both by :class:`~diffatmo.models.Moments` (what Blender's old model holds, by single scattering, as it does it), under
+    the same sun, 100 m above the ground, at 100 directions from the zenith to the horizon that weigh as solid angle. What
+    else the target's own model of the sky adds is not in it.
     """
-    given, held = _given_and_held(atmosphere, target)
-    held = dataclasses.replace(held, solar_irradiance=jnp.ones_like(given.solar_irradiance))
-    given = dataclasses.replace(given, solar_irradiance=jnp.ones_like(given.solar_irradiance))
-    if not losses(given, target):
+    chosen = _target(target)
+    given, held = (_under_white_sun(air) for air in _given_and_held(atmosphere, target))
+    if chosen.model is Moments and not losses(given, target):
         return [SkyLoss(zenith, 0.0, 0.0) for zenith in SUN_ZENITHS_DEG]
     mu, weights = gauss_legendre(ROWS, 0.0, 1.0)
-    azimuths = np.pi * (np.arange(COLUMNS) + 0.5) / COLUMNS
-    views = _directions(mu[:, None], azimuths)
+    views = _directions(mu[:, None], np.pi * (np.arange(COLUMNS) + 0.5) / COLUMNS)
     suns = _directions(np.cos(np.radians(SUN_ZENITHS_DEG)), np.zeros(len(SUN_ZENITHS_DEG)))
-    before, after = (np.asarray(outermost(_skies)(air, jnp.asarray(views), jnp.asarray(suns))) for air in (given, held))
+    skies = outermost(_skies)
+    before, after = (
+        np.asarray(skies(model(), air, jnp.asarray(views), jnp.asarray(suns)))
+        for model, air in ((Moments, given), (chosen.model, held))
+    )
     difference = after / before - 1
     squares = np.mean(difference**2, axis=(2, 3)) @ weights / weights.sum()
-    found = []
-    for zenith, square, values in zip(SUN_ZENITHS_DEG, squares, difference, strict=True):
-        found.append(SkyLoss(zenith, float(np.sqrt(square)), float(values.flat[np.argmax(np.abs(values))])))
-    return found
+    largest = [float(values.flat[np.argmax(np.abs(values))]) for values in difference]
+    return [SkyLoss(*row) for row in zip(SUN_ZENITHS_DEG, np.sqrt(squares).tolist(), largest, strict=True)]
+
+
+def _under_white_sun(air: Atmosphere) -> Atmosphere:
+    return dataclasses.replace(air, solar_irradiance=jnp.ones_like(air.wavelengths))
 
 
 def _directions(mu: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
@@ -237,8 +297,8 @@ def _directions(mu: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
     return np.stack([sine * np.sin(azimuth), sine * np.cos(azimuth), mu], axis=-1)
 
 
-def _skies(air: Atmosphere, views: Array, suns: Array) -> Float[Array, "sun row column w"]:
-    sky = Moments().sky(air)
+def _skies(model: Model, air: Atmosphere, views: Array, suns: Array) -> Float[Array, "sun row column w"]:
+    sky = model.sky(air)
     shape = (suns.shape[0], *views.shape)
     sun = jnp.broadcast_to(suns[:, None, None, :], shape)
     view = jnp.broadcast_to(views, shape)
@@ -255,6 +315,9 @@ __all__ = [
     "Target",
     "losses",
     "read",
+    "remarks",
     "sky_losses",
+    "summary",
+    "target_of",
     "write",
 ]

@@ -6,15 +6,15 @@ an :class:`Atmosphere`: profiles of other shapes keep their column, and the abso
 
 import ast
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from diffatmo import spectrum
-from diffatmo._types import Spectrum
 from diffatmo.atmosphere import Atmosphere
-from diffatmo.presets.fields import PresetError, number, plain
+from diffatmo.presets.fields import PresetError, Wavelengths, number, plain
 
 DENSITIES = ("air_density", "aerosol_density", "ozone_density")
 
@@ -84,17 +84,17 @@ def _log(wavelengths: Float[np.ndarray, " w"], values: tuple[float, ...]) -> Flo
     return np.asarray(np.exp(logs[segment] + slope * (x - nodes[segment])))
 
 
-def _coefficients(air: _Air, wavelengths: Spectrum) -> Float[np.ndarray, "kind w"]:
+def _coefficients(air: _Air, wavelengths: Wavelengths) -> Float[np.ndarray, "kind w"]:
     """Rayleigh scattering, Mie scattering and absorption, and ozone's absorption at its peak, all at density 1, 1/km."""
     bands = np.asarray(wavelengths, float)
     if air is SINGLE:
         # Rayleigh's law with n = 1.0002926; 300 DU of ozone; 2e-5 / m of aerosol, whose extinction is 1.11 times that.
-        ozone = spectrum.ozone_absorption(wavelengths, column_du=300.0, half_width=air.ozone_half_width)
+        ozone = spectrum.ozone_absorption(jnp.asarray(bands), column_du=300.0, half_width=air.ozone_half_width)
         mie = np.full_like(bands, 2e-2)
         return np.stack([1.1312e-3 * (bands / 1e3) ** -4, mie, 0.11 * mie, np.asarray(ozone)])
     # 334.5 times the column of 3.78547397e20 exp(-5.5556 (ln h - 3.22261)²) / h, in Dobson units.
     column = 334.5 * 3.78547397e20 * math.sqrt(2 * math.pi * _LN_VARIANCE) / 2.6867e20
-    ozone = spectrum.ozone_absorption(wavelengths, column_du=column, half_width=air.ozone_half_width)
+    ozone = spectrum.ozone_absorption(jnp.asarray(bands), column_du=column, half_width=air.ozone_half_width)
     return np.stack(
         [
             _log(bands, (6.605e-3, 1.067e-2, 1.842e-2, 3.156e-2)),
@@ -105,9 +105,9 @@ def _coefficients(air: _Air, wavelengths: Spectrum) -> Float[np.ndarray, "kind w
     )
 
 
-def densities(air: _Air, atmosphere: Atmosphere) -> tuple[float, float, float]:
+def densities(air: _Air, atmosphere: Atmosphere) -> list[float]:
     """Of air, aerosol and ozone: by least squares of the vertical optical depths, aerosol's scattering and absorption apart."""
-    rayleigh, scattering, absorption, ozone = _coefficients(air, atmosphere.wavelengths)
+    rayleigh, scattering, absorption, ozone = _coefficients(air, np.asarray(atmosphere.wavelengths))
     heights = (
         (atmosphere.rayleigh_scale_height, air.rayleigh_scale_height),
         (atmosphere.mie_scale_height, air.mie_scale_height),
@@ -115,16 +115,18 @@ def densities(air: _Air, atmosphere: Atmosphere) -> tuple[float, float, float]:
     )
     spectra = (
         (atmosphere.rayleigh_scattering, rayleigh),
-        (np.concatenate([atmosphere.mie_scattering, atmosphere.mie_absorption]), np.concatenate([scattering, absorption])),
+        (
+            np.concatenate([atmosphere.mie_scattering, atmosphere.mie_absorption]),
+            np.concatenate([scattering, absorption]),
+        ),
         (atmosphere.ozone_absorption, ozone),
     )
 
-    def ratio(heights: tuple, spectra: tuple) -> float:
-        wanted, one = (float(h) * np.asarray(s, float) for h, s in zip(heights, spectra, strict=True))
-        return min(wanted @ one / (one @ one), air.largest)
-
-    values = tuple(ratio(h, s) for h, s in zip(heights, spectra, strict=True))
-    return values  # type: ignore[return-value]
+    values = []
+    for (height, own_height), (spectrum_, own) in zip(heights, spectra, strict=True):
+        wanted, one = float(height) * np.asarray(spectrum_, float), own_height * own
+        values.append(min(float(wanted @ one / (one @ one)), air.largest))
+    return values
 
 
 def _script(air: _Air, atmosphere: Atmosphere, remarks: str) -> str:
@@ -139,6 +141,7 @@ def _script(air: _Air, atmosphere: Atmosphere, remarks: str) -> str:
 else:
     sky.sky_type = "SINGLE_SCATTERING"
     sky.aerosol_density = {values[aerosol]}"""
+    # The densities before the links: whatever is left of a script that was cut off has them whole, or says that it was.
     return f"""{remarks}import bpy
 
 world = bpy.context.scene.world or bpy.data.worlds.new("World")
@@ -153,14 +156,13 @@ def node(name):
 
 
 sky = node("ShaderNodeTexSky")
-background = node("ShaderNodeBackground")
-output = node("ShaderNodeOutputWorld")
-links.new(sky.outputs["Color"], background.inputs["Color"])
-links.new(background.outputs["Background"], output.inputs["Surface"])
-
 {choice}
 sky.air_density = {values["air_density"]}
 sky.ozone_density = {values["ozone_density"]}
+
+background, output = node("ShaderNodeBackground"), node("ShaderNodeOutputWorld")
+links.new(sky.outputs["Color"], background.inputs["Color"])
+links.new(background.outputs["Background"], output.inputs["Surface"])
 """
 
 
@@ -186,7 +188,7 @@ def _assigned(text: str) -> dict[str, str]:
     return found
 
 
-def _read(air: _Air, text: str, wavelengths: Spectrum) -> Atmosphere:
+def _read(air: _Air, text: str, wavelengths: Wavelengths) -> dict[str, Any]:
     found = _assigned(text)
     sky_type = found.get("sky_type", "nothing").strip("'\"")
     if sky_type not in air.sky_types:
@@ -196,23 +198,23 @@ def _read(air: _Air, text: str, wavelengths: Spectrum) -> Atmosphere:
             raise PresetError(f"{key}: missing, expected a number from 0 to {air.largest:g}")
     air_density, aerosol, ozone = (number(key, found[key], lowest=0, highest=air.largest) for key in DENSITIES)
     rayleigh, scattering, absorption, absorber = _coefficients(air, wavelengths)
-    return Atmosphere(
-        wavelengths=wavelengths,
-        solar_irradiance=np.ones(len(wavelengths)),
-        bottom_radius=air.bottom_radius,
-        top_radius=air.bottom_radius + air.height,
-        rayleigh_scattering=air_density * rayleigh,
-        rayleigh_scale_height=air.rayleigh_scale_height,
-        mie_scattering=aerosol * scattering,
-        mie_absorption=aerosol * absorption,
-        mie_scale_height=air.mie_scale_height,
-        mie_g=air.mie_g,
-        ozone_absorption=ozone * absorber,
-        ground_albedo=np.full(len(wavelengths), air.ground_albedo),
-        ozone_center_altitude=air.ozone_center_altitude,
-        ozone_half_width=air.ozone_half_width,
-        mie_phase=air.mie_phase,
-    )
+    return {
+        "wavelengths": wavelengths,
+        "solar_irradiance": np.ones(len(wavelengths)),
+        "bottom_radius": air.bottom_radius,
+        "top_radius": air.bottom_radius + air.height,
+        "rayleigh_scattering": air_density * rayleigh,
+        "rayleigh_scale_height": air.rayleigh_scale_height,
+        "mie_scattering": aerosol * scattering,
+        "mie_absorption": aerosol * absorption,
+        "mie_scale_height": air.mie_scale_height,
+        "mie_g": air.mie_g,
+        "ozone_absorption": ozone * absorber,
+        "ground_albedo": np.full(len(wavelengths), air.ground_albedo),
+        "ozone_center_altitude": air.ozone_center_altitude,
+        "ozone_half_width": air.ozone_half_width,
+        "mie_phase": air.mie_phase,
+    }
 
 
 def dumps(atmosphere: Atmosphere, remarks: str) -> str:
@@ -220,7 +222,7 @@ def dumps(atmosphere: Atmosphere, remarks: str) -> str:
     return _script(MULTIPLE, atmosphere, remarks)
 
 
-def loads(text: str, wavelengths: Spectrum) -> Atmosphere:
+def loads(text: str, wavelengths: Wavelengths) -> dict[str, Any]:
     """What a script for Blender 5.0 and later says, at ``wavelengths``."""
     return _read(MULTIPLE, text, wavelengths)
 
@@ -230,6 +232,6 @@ def dumps_nishita(atmosphere: Atmosphere, remarks: str) -> str:
     return _script(SINGLE, atmosphere, remarks)
 
 
-def loads_nishita(text: str, wavelengths: Spectrum) -> Atmosphere:
+def loads_nishita(text: str, wavelengths: Wavelengths) -> dict[str, Any]:
     """What a script for the model of single scattering says, at ``wavelengths``."""
     return _read(SINGLE, text, wavelengths)

@@ -4,11 +4,22 @@ Lengths are in metres, coefficients in 1/m, wavelengths in nm and rising; the ae
 """
 
 import re
+from typing import Any
 
-from diffatmo._types import Spectrum
 from diffatmo.atmosphere import Atmosphere
 from diffatmo.presets import layers
-from diffatmo.presets.fields import PresetError, asymmetry_as, decimals, number, numbers, plain, rest, scaled, total
+from diffatmo.presets.fields import (
+    PresetError,
+    Wavelengths,
+    asymmetry_as,
+    decimals,
+    number,
+    numbers,
+    plain,
+    rest,
+    scaled,
+    total,
+)
 
 TO_METRES = 3
 
@@ -66,7 +77,7 @@ namespace preset {{
 """
 
 
-def loads(text: str, wavelengths: Spectrum) -> Atmosphere:
+def loads(text: str, wavelengths: Wavelengths) -> dict[str, Any]:
     """The parameters in a header, which says its wavelengths itself."""
     del wavelengths
     code = re.sub(r"//[^\n]*|/\*.*?\*/", "", text, flags=re.DOTALL)
@@ -99,20 +110,20 @@ def loads(text: str, wavelengths: Spectrum) -> Atmosphere:
     heights = [layers.scale_height(key, density(key)) for key in ("kRayleighDensity", "kMieDensity")]
     lengths = [scalar("kBottomRadius"), scalar("kTopRadius"), *heights, center, half_width]
     bottom, top, rayleigh_height, mie_height, center, half_width = scaled(lengths, -TO_METRES)
-    return Atmosphere(
-        wavelengths=rising[::-1],
-        solar_irradiance=spectrum("kSolarIrradiance"),
-        bottom_radius=bottom,
-        top_radius=top,
-        rayleigh_scattering=spectrum("kRayleighScattering", TO_METRES),
-        rayleigh_scale_height=rayleigh_height,
-        mie_scattering=scattering,
-        mie_absorption=rest("kMieExtinction", extinction, scattering),
-        mie_scale_height=mie_height,
-        mie_g=scalar("kMiePhaseFunctionG", -1.0),
-        ozone_absorption=ozone,
-        ground_albedo=spectrum("kGroundAlbedo"),
-        ozone_center_altitude=center,
-        ozone_half_width=half_width,
-        mie_phase="cornette-shanks",
-    )
+    return {
+        "wavelengths": rising[::-1],
+        "solar_irradiance": spectrum("kSolarIrradiance"),
+        "bottom_radius": bottom,
+        "top_radius": top,
+        "rayleigh_scattering": spectrum("kRayleighScattering", TO_METRES),
+        "rayleigh_scale_height": rayleigh_height,
+        "mie_scattering": scattering,
+        "mie_absorption": rest("kMieExtinction", extinction, scattering),
+        "mie_scale_height": mie_height,
+        "mie_g": scalar("kMiePhaseFunctionG", -1.0),
+        "ozone_absorption": ozone,
+        "ground_albedo": spectrum("kGroundAlbedo"),
+        "ozone_center_altitude": center,
+        "ozone_half_width": half_width,
+        "mie_phase": "cornette-shanks",
+    }

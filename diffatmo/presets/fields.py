@@ -5,12 +5,15 @@ import math
 import re
 from collections.abc import Sequence
 from decimal import Decimal
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
+from jaxtyping import Float
 
 from diffatmo import phase
 from diffatmo.atmosphere import SPECTRAL, Atmosphere
+
+Wavelengths: TypeAlias = Float[np.ndarray, " w"]
 
 RED_GREEN_BLUE = (680.0, 550.0, 440.0)
 """Wavelengths, nm, that stand for a renderer's channels where nothing else is said (Bruneton & Neyret 2008)."""
@@ -35,7 +38,9 @@ def number(key: str, text: str, *, lowest: float = -math.inf, highest: float = m
     """The number in ``text``; :class:`PresetError` for anything else, or one out of range."""
     expected = "a finite number"
     if not math.isinf(lowest):
-        expected = f"a number of at least {lowest:g}" if math.isinf(highest) else f"a number from {lowest:g} to {highest:g}"
+        expected = (
+            f"a number of at least {lowest:g}" if math.isinf(highest) else f"a number from {lowest:g} to {highest:g}"
+        )
     try:
         value = float(text.strip())
     except ValueError:
@@ -79,7 +84,7 @@ def arranged(atmosphere: Atmosphere, *, three: bool) -> Atmosphere:
     """
     wavelengths = np.asarray(atmosphere.wavelengths)
     order = np.argsort(-wavelengths)
-    spectra = {name: np.asarray(getattr(atmosphere, name))[order] for name in SPECTRAL}
+    spectra: dict[str, Any] = {name: np.asarray(getattr(atmosphere, name))[order] for name in SPECTRAL}
     if three and wavelengths.size != 3:
         spectra = {
             name: np.interp(RED_GREEN_BLUE, wavelengths[order][::-1], values[::-1]) for name, values in spectra.items()
@@ -95,7 +100,6 @@ def asymmetry_as(atmosphere: Atmosphere, name: str) -> float:
     if atmosphere.mie_phase == name:
         return float(str(np.asarray(atmosphere.mie_g)))
     mean = float(phase.mie_moments(atmosphere.mie_g, 1, atmosphere.mie_phase)[1])
-    if name == "henyey-greenstein":
-        return mean
     roots = np.roots([3, -5 * mean, 12, -10 * mean])
-    return float(roots[np.argmin(np.abs(roots.imag))].real)
+    g = mean if name == "henyey-greenstein" else roots[np.argmin(np.abs(roots.imag))].real
+    return float(str(np.asarray(g, atmosphere.mie_g.dtype)))

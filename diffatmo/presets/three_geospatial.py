@@ -5,18 +5,31 @@ phase function is Cornette-Shanks'.
 """
 
 import re
+from typing import Any
 
 import numpy as np
 
-from diffatmo._types import Spectrum
 from diffatmo.atmosphere import Atmosphere
 from diffatmo.presets import layers
-from diffatmo.presets.fields import PresetError, asymmetry_as, decimals, number, numbers, plain, rest, scaled, total
+from diffatmo.presets.fields import (
+    PresetError,
+    Wavelengths,
+    asymmetry_as,
+    decimals,
+    number,
+    numbers,
+    plain,
+    rest,
+    scaled,
+    total,
+)
 
 
 def dumps(atmosphere: Atmosphere, remarks: str) -> str:
     """A module that exports the parameters, for three wavelengths from red to blue."""
-    center, half_width = (float(decimals(x)[0]) for x in (atmosphere.ozone_center_altitude, atmosphere.ozone_half_width))
+    center, half_width = (
+        float(decimals(x)[0]) for x in (atmosphere.ozone_center_altitude, atmosphere.ozone_half_width)
+    )
 
     def vector(values: object, kind: str = "Vector3") -> str:
         return f"new {kind}({', '.join(map(plain, values if isinstance(values, list) else decimals(values)))})"
@@ -52,7 +65,7 @@ export const atmosphere = new AtmosphereParameters({{
 """
 
 
-def loads(text: str, wavelengths: Spectrum) -> Atmosphere:
+def loads(text: str, wavelengths: Wavelengths) -> dict[str, Any]:
     """The parameters in a module; its channels are ``wavelengths``."""
     code = re.sub(r"//[^\n]*|/\*.*?\*/", "", text, flags=re.DOTALL)
     body = re.search(r"new\s+AtmosphereParameters\(\s*\{(.*)\}\s*\)", code, re.DOTALL)
@@ -87,20 +100,20 @@ def loads(text: str, wavelengths: Spectrum) -> Atmosphere:
     if any(ozone):
         center, half_width = layers.center_and_half_width("absorptionDensity", profile("absorptionDensity"))
     bottom, top = scaled([scalar("bottomRadius"), scalar("topRadius")], -3)
-    return Atmosphere(
-        wavelengths=wavelengths,
-        solar_irradiance=vector("solarIrradiance"),
-        bottom_radius=bottom,
-        top_radius=top,
-        rayleigh_scattering=vector("rayleighScattering"),
-        rayleigh_scale_height=layers.scale_height("rayleighDensity", profile("rayleighDensity")),
-        mie_scattering=scattering,
-        mie_absorption=rest("mieExtinction", extinction, scattering),
-        mie_scale_height=layers.scale_height("mieDensity", profile("mieDensity")),
-        mie_g=scalar("miePhaseFunctionG", -1.0),
-        ozone_absorption=ozone,
-        ground_albedo=np.array(vector("groundAlbedo")),
-        ozone_center_altitude=center,
-        ozone_half_width=half_width,
-        mie_phase="cornette-shanks",
-    )
+    return {
+        "wavelengths": wavelengths,
+        "solar_irradiance": vector("solarIrradiance"),
+        "bottom_radius": bottom,
+        "top_radius": top,
+        "rayleigh_scattering": vector("rayleighScattering"),
+        "rayleigh_scale_height": layers.scale_height("rayleighDensity", profile("rayleighDensity")),
+        "mie_scattering": scattering,
+        "mie_absorption": rest("mieExtinction", extinction, scattering),
+        "mie_scale_height": layers.scale_height("mieDensity", profile("mieDensity")),
+        "mie_g": scalar("miePhaseFunctionG", -1.0),
+        "ozone_absorption": ozone,
+        "ground_albedo": np.array(vector("groundAlbedo")),
+        "ozone_center_altitude": center,
+        "ozone_half_width": half_width,
+        "mie_phase": "cornette-shanks",
+    }

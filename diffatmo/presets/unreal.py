@@ -6,13 +6,15 @@ Henyey-Greenstein's, Mie and Rayleigh fall off exponentially, what else absorbs 
 """
 
 import re
+from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from diffatmo import color
 from diffatmo._types import Spectrum
 from diffatmo.atmosphere import Atmosphere
-from diffatmo.presets.fields import PresetError, asymmetry_as, decimals, number, plain
+from diffatmo.presets.fields import PresetError, Wavelengths, asymmetry_as, decimals, number, plain
 
 LARGEST_G = 0.999
 LEAST_SCALE_HEIGHT = 0.1
@@ -93,11 +95,12 @@ def _distribution(scale_height: object) -> str:
     return plain(max(float(decimals(scale_height)[0]), LEAST_SCALE_HEIGHT))
 
 
-def loads(text: str, wavelengths: Spectrum) -> Atmosphere:
+def loads(text: str, wavelengths: Wavelengths) -> dict[str, Any]:
     """What a component says, or leaves at its default; its channels are ``wavelengths``."""
     properties = _properties(text)
     scalar = {
-        key: number(key, properties[key], lowest=0) if key in properties else default for key, default in SCALARS.items()
+        key: number(key, properties[key], lowest=0) if key in properties else default
+        for key, default in SCALARS.items()
     }
     if scalar["MultiScatteringFactor"] != 1:
         raise PresetError(
@@ -111,24 +114,24 @@ def loads(text: str, wavelengths: Spectrum) -> Atmosphere:
 
     codes = _struct(ALBEDO[0], properties, dict(zip("RGB", ALBEDO[1], strict=True)), highest=255)
     tent = _struct(TENT[0], properties, TENT[1])
-    return Atmosphere(
-        wavelengths=wavelengths,
-        solar_irradiance=np.ones(3),
-        bottom_radius=scalar["BottomRadius"],
-        top_radius=float(sum(decimals(scalar["BottomRadius"]) + decimals(scalar["AtmosphereHeight"]))),
-        rayleigh_scattering=coefficient("RayleighScattering"),
-        rayleigh_scale_height=scalar["RayleighExponentialDistribution"],
-        mie_scattering=coefficient("MieScattering"),
-        mie_absorption=coefficient("MieAbsorption"),
-        mie_scale_height=scalar["MieExponentialDistribution"],
-        mie_g=scalar["MieAnisotropy"],
+    return {
+        "wavelengths": wavelengths,
+        "solar_irradiance": np.ones(3),
+        "bottom_radius": scalar["BottomRadius"],
+        "top_radius": float(sum(decimals(scalar["BottomRadius"]) + decimals(scalar["AtmosphereHeight"]))),
+        "rayleigh_scattering": coefficient("RayleighScattering"),
+        "rayleigh_scale_height": scalar["RayleighExponentialDistribution"],
+        "mie_scattering": coefficient("MieScattering"),
+        "mie_absorption": coefficient("MieAbsorption"),
+        "mie_scale_height": scalar["MieExponentialDistribution"],
+        "mie_g": scalar["MieAnisotropy"],
         # The tent's tip is a factor on all of it.
-        ozone_absorption=[tent["TipValue"] * value for value in coefficient("OtherAbsorption")],
-        ground_albedo=color.srgb_decode(np.array(list(codes.values())) / 255),
-        ozone_center_altitude=tent["TipAltitude"],
-        ozone_half_width=tent["Width"],
-        mie_phase="henyey-greenstein",
-    )
+        "ozone_absorption": [tent["TipValue"] * value for value in coefficient("OtherAbsorption")],
+        "ground_albedo": color.srgb_decode(jnp.array(list(codes.values())) / 255),
+        "ozone_center_altitude": tent["TipAltitude"],
+        "ozone_half_width": tent["Width"],
+        "mie_phase": "henyey-greenstein",
+    }
 
 
 def _properties(text: str) -> dict[str, str]:
