@@ -47,8 +47,8 @@ class Target(NamedTuple):
     """It has three channels."""
     says_wavelengths: bool = False
     says_sun: bool = False
-    model: type[Model] = Moments
-    """What shows the effect of its losses; of Blender's old model, single scattering."""
+    scatters_once: bool = False
+    """Its sky is single scattering."""
 
 
 _G = "that of the other phase function, for the same mean cosine"
@@ -97,7 +97,7 @@ TARGETS: Mapping[str, Target] = {
         "#",
         _DENSITIES,
         "its coarse integrals; that light is scattered once only is in them",
-        model=RayMarch,
+        scatters_once=True,
     ),
     "three-geospatial": Target(
         three_geospatial.dumps,
@@ -261,24 +261,24 @@ def _numbers(value: object) -> tuple[float, ...]:
     return tuple(float(str(item)) for item in np.atleast_1d(np.asarray(value)))
 
 
-def sky_losses(atmosphere: Atmosphere, target: str) -> list[SkyLoss]:
+def sky_losses(atmosphere: Atmosphere, target: str, *, model: Model | None = None) -> list[SkyLoss]:
     """How the sky of what ``target`` holds differs from that of ``atmosphere``, at the target's bands.
 
-    Both by :class:`~diffatmo.models.Moments` (what Blender's old model holds, by single scattering, as it does it), under
-    the same sun, 100 m above the ground, at 100 directions from the zenith to the horizon that weigh as solid angle. What
-    else the target's own model of the sky adds is not in it.
+    Both by ``model``, :class:`~diffatmo.models.Moments` by default (what Blender's old model holds by single scattering, as it
+    does it), under the same sun, 100 m above the ground, at 100 directions from the zenith to the horizon that weigh as solid
+    angle. What else the target's own model of the sky adds is not in it.
     """
-    chosen = _target(target)
+    model = Moments() if model is None else model
+    its_model = RayMarch() if _target(target).scatters_once else model
     given, held = (_under_white_sun(air) for air in _given_and_held(atmosphere, target))
-    if chosen.model is Moments and not losses(given, target):
+    if its_model is model and not losses(given, target):
         return [SkyLoss(zenith, 0.0, 0.0) for zenith in SUN_ZENITHS_DEG]
     mu, weights = gauss_legendre(ROWS, 0.0, 1.0)
     views = _directions(mu[:, None], np.pi * (np.arange(COLUMNS) + 0.5) / COLUMNS)
     suns = _directions(np.cos(np.radians(SUN_ZENITHS_DEG)), np.zeros(len(SUN_ZENITHS_DEG)))
-    skies = outermost(_skies)
     before, after = (
-        np.asarray(skies(model(), air, jnp.asarray(views), jnp.asarray(suns)))
-        for model, air in ((Moments, given), (chosen.model, held))
+        np.asarray(outermost(_skies)(its, air, jnp.asarray(views), jnp.asarray(suns)))
+        for its, air in ((model, given), (its_model, held))
     )
     difference = after / before - 1
     squares = np.mean(difference**2, axis=(2, 3)) @ weights / weights.sum()
