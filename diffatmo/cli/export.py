@@ -73,7 +73,7 @@ def export(
 ) -> None:
     """Write an atmosphere for a renderer.
 
-    ATM.toml is an atmosphere file or the name of a preset. With --luts, PATH is a folder: it receives every table of a model
+    ATM.toml is an atmosphere file, earth, or mars. With --luts, PATH is a folder: it receives every table of a model
     as EXR, in single and in half precision, each with its parameterisation, its unit and what it omits in the header, and a
     README that says how to sample them. The sun, the camera and the altitude matter to hillaire only, whose last three tables
     belong to one place.
