@@ -280,7 +280,8 @@ def sky_losses(atmosphere: Atmosphere, target: str, *, model: Model | None = Non
         np.asarray(outermost(_skies)(its, air, jnp.asarray(views), jnp.asarray(suns)))
         for its, air in ((model, given), (its_model, held))
     )
-    difference = after / before - 1
+    # A band in which nothing scatters is black before and after.
+    difference = np.divide(after, before, out=np.ones_like(before), where=before > 0) - 1
     squares = np.mean(difference**2, axis=(2, 3)) @ weights / weights.sum()
     largest = [float(values.flat[np.argmax(np.abs(values))]) for values in difference]
     return [SkyLoss(*row) for row in zip(SUN_ZENITHS_DEG, np.sqrt(squares).tolist(), largest, strict=True)]
