@@ -38,7 +38,11 @@ LEVELS = [
     ["diffatmo.models.hillaire.luts"],
     ["diffatmo.models.moments.sky"],
     [f"diffatmo.models.{name}" for name in ("raymarch", "moments", "bruneton", "hillaire", "pathtrace")],
+    ["diffatmo.presets.fields"],
+    ["diffatmo.presets.layers", "diffatmo.presets.unreal", "diffatmo.presets.blender"],
+    ["diffatmo.presets.three_geospatial", "diffatmo.presets.bruneton"],
     ["diffatmo.models"],
+    ["diffatmo.presets"],
     ["diffatmo.render", "diffatmo.imageio"],
     ["diffatmo.scene", "diffatmo.comparison", "diffatmo.export"],
     ["fitting._errors"],
@@ -70,6 +74,7 @@ LEVELS = [
     ["diffatmo.cli.many"],
     ["diffatmo.cli.radiance", "diffatmo.cli.render", "diffatmo.cli.fit"],
     ["diffatmo.cli.compare", "diffatmo.cli.export", "diffatmo.cli.plan"],
+    ["diffatmo.cli.imports"],
     ["diffatmo.cli.main"],
     ["diffatmo.__main__"],
 ]
@@ -140,7 +145,7 @@ def test_public_names_resolve():
 
 
 def test_model_names_of_the_command_line():
-    from diffatmo import camera, models
+    from diffatmo import camera, models, presets
     from diffatmo.models import tables
     from fitting import robust
 
@@ -149,6 +154,7 @@ def test_model_names_of_the_command_line():
     assert robust.LOSSES == scenefile.LOSSES
     assert tuple(camera.MAPPINGS) == keys.MAPPINGS
     assert export.PARAMETERISATIONS == tables.PARAMETERISATIONS
+    assert tuple(presets.TARGETS) == export.PRESETS
 
 
 def test_help_imports_no_jax():

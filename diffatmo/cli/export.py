@@ -1,4 +1,4 @@
-"""``diffatmo export``: the tables of Bruneton or Hillaire, for a renderer."""
+"""``diffatmo export``: an atmosphere for a renderer, as the tables of Bruneton or Hillaire, or as its own parameters."""
 
 from importlib.resources import files
 from pathlib import Path
@@ -8,7 +8,7 @@ import click
 
 from diffatmo import folders
 from diffatmo.cli import keys
-from diffatmo.cli.common import InputError, overwrite_option, read_atmosphere
+from diffatmo.cli.common import InputError, check_output, make_console, overwrite_option, read_atmosphere
 from diffatmo.cli.keys import CAMERA_KEYS, PLACE_KEYS, Number
 from diffatmo.cli.render import DEFAULTS, SIZE, make_scene
 
@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 LUTS = ("bruneton", "hillaire")
 PARAMETERISATIONS = ("2017", "2008")
 """Those of ``diffatmo.models.tables``, repeated here because importing that takes seconds; a test compares the two."""
+
+PRESETS = ("unreal", "blender", "blender-nishita", "three-geospatial", "bruneton")
+"""Those of ``diffatmo.presets``; likewise."""
 
 FOLDERS = ("float", "half", "README.md")
 VOLUME_KEYS = {"reach_km": Number("How far the aerial perspective reaches.", 0, positive=True)}
@@ -34,8 +37,16 @@ TABLE = "the table of the atmosphere file, linear in nu between its angles, divi
 
 @click.command()
 @click.argument("atmosphere", metavar="ATM.toml")
-@click.option("--luts", type=click.Choice(LUTS), required=True, help="Whose tables.")
-@click.option("-o", "--output", metavar="DIR", type=click.Path(path_type=Path), required=True, help="Folder to write.")
+@click.option("--luts", type=click.Choice(LUTS), help="Whose tables.")
+@click.option("--preset", type=click.Choice(PRESETS), help="Whose parameters.")
+@click.option(
+    "-o",
+    "--output",
+    metavar="PATH",
+    type=click.Path(path_type=Path),
+    required=True,
+    help="Folder to write the tables to, or file for the parameters.",
+)
 @click.option(
     "--parameterisation",
     type=click.Choice(PARAMETERISATIONS),
@@ -50,7 +61,8 @@ TABLE = "the table of the atmosphere file, linear in nu between its angles, divi
 @overwrite_option
 def export(
     atmosphere: str,
-    luts: str,
+    luts: str | None,
+    preset: str | None,
     output: Path,
     parameterisation: str | None,
     orders: int | None,
@@ -59,15 +71,29 @@ def export(
     overwrite: bool,
     **values: Any,
 ) -> None:
-    """Write the tables of a model as textures.
+    """Write an atmosphere for a renderer.
 
-    ATM.toml is an atmosphere file or the name of a preset. DIR receives every table as EXR, in single and in half precision,
-    each with its parameterisation, its unit and what it omits in the header, and a README that says how to sample them. The
-    sun, the camera and the altitude matter to hillaire only, whose last three tables belong to one place.
+    ATM.toml is an atmosphere file, earth, or mars. With --luts, PATH is a folder: it receives every table of a model
+    as EXR, in single and in half precision, each with its parameterisation, its unit and what it omits in the header, and a
+    README that says how to sample them. The sun, the camera and the altitude matter to hillaire only, whose last three tables
+    belong to one place.
+
+    With --preset, PATH is a file in the renderer's own terms: text to paste into Unreal's editor, a Python script for Blender,
+    a JavaScript module for three-geospatial, a C++ header for Bruneton's demo. What the renderer cannot hold, and what that
+    does to the sky, is printed, and said in the file. diffatmo import reads such a file.
     """
     of_place = keys.given(VOLUME_KEYS | CAMERA_KEYS | PLACE_KEYS, values)
     of_camera = of_place | {k: v for k, v in {"width": width, "height": height}.items() if v is not None}
     of_tables = {k: v for k, v in {"parameterisation": parameterisation, "orders": orders}.items() if v is not None}
+    if luts is not None and preset is not None:
+        raise InputError("--preset contradicts --luts: give one or the other")
+    if preset is not None:
+        for name in of_camera | of_tables:
+            raise InputError(f"{keys.flag_of(name)} contradicts --preset: it belongs to --luts")
+        _export_preset(atmosphere, preset, output, overwrite=overwrite)
+        return
+    if luts is None:
+        raise InputError("--luts or --preset: missing, expected one of them")
     for name in of_camera if luts == "bruneton" else of_tables:
         raise InputError(f"{keys.flag_of(name)} contradicts --luts {luts}: it belongs to the other one")
     options = VIEWED | keys.with_sun(of_place)
@@ -95,6 +121,30 @@ def export(
         path.write_text(_readme(luts, textures, facts), encoding="utf-8")
     console.print(shown)
     console.print(f"{len(written)} pictures; how to sample them: {output / 'README.md'}", soft_wrap=True)
+
+
+def _export_preset(atmosphere: str, preset: str, output: Path, *, overwrite: bool) -> None:
+    check_output(output, overwrite=overwrite)
+    air = read_atmosphere(atmosphere)
+    from rich.table import Table
+
+    from diffatmo import imageio, presets
+
+    console = make_console()
+    lost = presets.losses(air, preset)
+    with console.status("comparing the skies …"):
+        skies = presets.sky_losses(air, preset)
+    text = presets.write(air, preset, remarks=presets.remarks(preset, lost, skies))
+    with imageio.atomic_write(output, overwrite=overwrite) as path:
+        path.write_text(text, encoding="utf-8")
+    table = Table("parameter", "atmosphere", "held", "why")
+    for loss in lost:
+        table.add_row(loss.key, loss.before, loss.after, loss.why)
+    if lost:
+        console.print(table)
+    for line in presets.summary(preset, lost, skies):
+        console.print(line, soft_wrap=True)
+    console.print(f"{output}: {presets.TARGETS[preset].use}", soft_wrap=True)
 
 
 def _bruneton(air: "Atmosphere", parameterisation: str, orders: int) -> "tuple[list[Texture], str, dict[str, Any]]":

@@ -15,6 +15,7 @@ from diffatmo.cli.common import INTERRUPTED, is_refusal, one_line
 from diffatmo.cli.compare import compare
 from diffatmo.cli.export import export
 from diffatmo.cli.fit import fit
+from diffatmo.cli.imports import import_preset
 from diffatmo.cli.plan import plan
 from diffatmo.cli.radiance import radiance
 from diffatmo.cli.render import render
@@ -43,6 +44,7 @@ diffatmo.add_command(render)
 diffatmo.add_command(fit)
 diffatmo.add_command(compare)
 diffatmo.add_command(export)
+diffatmo.add_command(import_preset)
 diffatmo.add_command(plan)
 
 
