@@ -39,6 +39,10 @@ FLARE_RADIUS = np.radians(25.0)
 """As far as a star or a ghost of the lens is looked for."""
 
 
+LOW = np.radians(20.0)
+"""Elevation below which haze lies in layers."""
+
+
 class MaskError(ValueError):
     """A picture cannot be masked; the message says what would be right."""
 
@@ -135,9 +139,10 @@ def find_sky(
         turns=turns,
     )
     found, cover = _label(small)
-    margin = _margin(found.shape[1], turns)
-    label = np.kron(found[:, margin : found.shape[1] - margin], np.ones((factor, factor), dtype=np.uint8))
-    label = label[: pixels.shape[0], : pixels.shape[1]].astype(np.uint8)
+    wide = found.shape[1]
+    margin = (wide - wide * 4 // 5) // 2 if turns else 0
+    label = found[:, margin : wide - margin].repeat(factor, axis=0).repeat(factor, axis=1)
+    label = label[: pixels.shape[0], : pixels.shape[1]]
     label[clipped] = SATURATED
     if elevation is not None:
         label[np.asarray(elevation) < 0] = BELOW
@@ -157,6 +162,18 @@ class _Small(NamedTuple):
 
 def _label(small: _Small) -> tuple[np.ndarray, float]:
     """Labels at the working size, and the cloud cover."""
+    if small.elevation is not None:
+        rows = np.flatnonzero((small.elevation >= 0).any(axis=1))
+        label = np.full(small.clipped.shape, BELOW, dtype=np.uint8)
+        if rows.size == 0:
+            return label, np.nan
+        part = slice(rows[0], rows[-1] + 1)
+        label[part], cover = _label_upper(_Small(*(each[part] if isinstance(each, np.ndarray) else each for each in small)))
+        return label, cover
+    return _label_upper(small)
+
+
+def _label_upper(small: _Small) -> tuple[np.ndarray, float]:
     seen = _features(small)
     above = _above(small, seen)
     label = np.full(above.shape, OBJECT, dtype=np.uint8)
@@ -165,6 +182,8 @@ def _label(small: _Small) -> tuple[np.ndarray, float]:
     ground = ~above
     if small.elevation is None:
         ground[-1] = True
+    else:
+        ground |= small.elevation < np.radians(1)
     candidate = above & seen.lit & ~small.clipped & ~sun
     cover = np.nan
     if (overcast := _is_overcast(small, seen, candidate)) or not candidate.any():
@@ -205,11 +224,6 @@ def _is_panorama(elevation: np.ndarray) -> bool:
     return width >= 2 * height and bool(np.ptp(elevation, axis=1).max() < 1e-3) and elevation.max() > np.radians(80)
 
 
-def _margin(width: int, turns: bool) -> int:
-    """Columns that :func:`_wrapped` added on either side of a picture that is now ``width`` wide."""
-    return width // 10 if turns else 0
-
-
 def _wrapped(image: np.ndarray, turns: bool) -> np.ndarray:
     if not turns:
         return image
@@ -217,7 +231,7 @@ def _wrapped(image: np.ndarray, turns: bool) -> np.ndarray:
     return np.concatenate([image[:, image.shape[1] - columns :], image, image[:, :columns]], axis=1)
 
 
-def _blurred(image: np.ndarray, sigma: float) -> np.ndarray:
+def _blurred(image: np.ndarray, sigma: float | tuple[float, float]) -> np.ndarray:
     from skimage import filters
 
     return filters.gaussian(image.astype(np.float32), sigma=sigma, mode="nearest", preserve_range=True)
@@ -239,7 +253,8 @@ def _clipped(pixels: np.ndarray, saturation: float | None) -> np.ndarray:
         return (pixels >= saturation).any(axis=-1)
     clipped = np.zeros(pixels.shape[:2], dtype=bool)
     for channel in np.moveaxis(pixels, -1, 0):
-        values, counts = np.unique(channel[np.isfinite(channel)], return_counts=True)
+        finite = channel[np.isfinite(channel)]
+        values, counts = np.unique(finite[finite >= 0.9 * finite.max(initial=0)], return_counts=True)
         if values.size and values[-1] > 0 and counts[-1] >= 9 and counts[-1] > 3 * counts[-4:-1].max(initial=0):
             clipped |= channel >= 0.985 * values[-1]
     return clipped | np.isposinf(pixels).any(axis=-1)
@@ -350,12 +365,14 @@ def _clear(
     sky = np.isin(pieces, agree)
     redder, brighter = (image - _lower_edge(image, basis, sky) for image in (seen.ratio, seen.luminance))
     redder = redder - _layers(redder, small, sky)
-    thin = sky & _is_mottled(redder, sky)
+    thin = sky & _is_mottled(redder, small, sky)
     # What is rough and stands clear of the ground is cloud if it is red and bright enough for one.
     rough = candidate & ~sky
     rest = measure.label(_dilated(rough, 1) | ground)
     grounded = np.isin(rest, rest[ground])
-    thick = rough & (redder > 0.05) & (brighter > -0.3) & ~(grounded & (_height(small) < 0.4))
+    free = rough & ~(grounded & (_height(small) < 0.4))
+    thick = free & (redder > 0.05) & (brighter > -0.3)
+    thick = free & _dilated(thick, 5)
     return sky & ~thin & ~_dilated(rough, 1), thin | thick
 
 
@@ -363,7 +380,7 @@ def _layers(image: np.ndarray, small: _Small, where: np.ndarray) -> np.ndarray:
     """What lies in layers: the median by elevation over the lowest 20 degrees, fading out above 15."""
     if small.elevation is None:
         return np.zeros_like(image)
-    low = where & (small.elevation >= 0) & (small.elevation < np.radians(20))
+    low = where & (small.elevation >= 0) & (small.elevation < LOW)
     number = (small.elevation[low] / np.radians(0.5)).astype(int)
     order = np.argsort(number, kind="stable")
     starts = np.flatnonzero(np.diff(number[order], prepend=-1))
@@ -372,25 +389,35 @@ def _layers(image: np.ndarray, small: _Small, where: np.ndarray) -> np.ndarray:
         return np.zeros_like(image)
     nodes = [float(small.elevation[low][group].mean()) for group in groups]
     medians = np.array([float(np.median(image[low][group])) for group in groups])
-    fade = np.clip((np.radians(20) - np.array(nodes)) / np.radians(5), 0, 1)
+    fade = np.clip((LOW - np.array(nodes)) / np.radians(5), 0, 1)
     return np.interp(small.elevation, nodes, medians * fade).astype(np.float32)
 
 
-def _is_mottled(redder: np.ndarray, sky: np.ndarray) -> np.ndarray:
-    """Where the sky is redder than it should be, and varies over one to five degrees: thin cloud."""
+def _is_mottled(redder: np.ndarray, small: _Small, sky: np.ndarray) -> np.ndarray:
+    """Where the sky is redder than it should be, and varies over one to five degrees: thin cloud.
+
+    Along the horizon of a panorama only what varies from column to column counts, which layers of haze and the belt of
+    twilight do not.
+    """
     near, far = max(1.0, redder.shape[1] / 600), max(3.0, redder.shape[1] / 100)
 
-    def mean(image: np.ndarray, sigma: float) -> np.ndarray:
+    def mean(image: np.ndarray, sigma: float | tuple[float, float]) -> np.ndarray:
         return _blurred(np.where(sky, image, 0), sigma) / np.maximum(_blurred(sky, sigma), 1e-3)
 
+    def texture(*shape: float) -> np.ndarray:
+        # This difference of means passes over slopes and parabolas: G(σ) f = f + σ²/2 f'' + …
+        wide = np.maximum(near, far * np.array(shape)), np.maximum(near, np.sqrt(2) * far * np.array(shape))
+        background = 2 * mean(redder, tuple(wide[0])) - mean(redder, tuple(wide[1]))
+        return np.sqrt(mean((smoothed - background) ** 2, far))
+
     smoothed = mean(redder, near)
-    # This difference of means passes over slopes and parabolas: G(σ) f = f + σ²/2 Δf + …
-    background = 2 * mean(redder, far) - mean(redder, np.sqrt(2) * far)
-    texture = np.sqrt(mean((smoothed - background) ** 2, far))
-    least = max(0.022, 3 * float(np.median(texture[sky])))
+    strength = texture(1, 1)
+    if small.turns and small.elevation is not None:
+        strength = np.where(small.elevation < LOW, np.minimum(strength, texture(0, 1)), strength)
+    least = max(0.022, 3 * float(np.median(strength[sky])))
     scatter = 1.4826 * float(np.median(np.abs(smoothed[sky])))
     above = sky & (smoothed > max(0.03, 2 * scatter))
-    return above & (texture > 0.6 * least) & _dilated(above & (texture > least), round(2 * far))
+    return above & (strength > 0.4 * least) & _dilated(above & (strength > least), round(2 * far))
 
 
 def _lower_edge(image: np.ndarray, basis: np.ndarray, where: np.ndarray) -> np.ndarray:
