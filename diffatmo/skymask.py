@@ -21,6 +21,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from diffatmo import saturation as saturated
+
 REASONS = ("sky", "not finite", "saturated", "below the horizon", "ground or object", "cloud", "sun and flare")
 """What a pixel shows, by its label."""
 
@@ -121,18 +123,16 @@ def find_sky(
 
     Always gives a mask, which may be empty. Raises :class:`MaskError` for arrays of the wrong shape.
     """
-    pixels = np.asarray(pixels, dtype=np.float32)
-    if pixels.ndim != 3 or pixels.shape[-1] != 3 or 0 in pixels.shape:
-        raise MaskError(f"pixels of shape {pixels.shape}, expected (height, width, 3)")
+    pixels = _checked(pixels)
     for name, angle in (("elevation", elevation), ("from_sun", from_sun)):
         if angle is not None and np.shape(angle) != pixels.shape[:2]:
             raise MaskError(f"{name} of shape {np.shape(angle)}, expected that of the picture, {pixels.shape[:2]}")
     finite = np.isfinite(pixels).all(axis=-1)
-    clipped = _clipped(pixels, saturation)
+    clipped = saturated.clipped(pixels, saturation=saturation)
     factor = -(-max(pixels.shape[:2]) // WORKING_SIZE)
     turns = elevation is not None and _is_panorama(np.asarray(elevation))
     small = _Small(
-        pixels=_wrapped(_reduced(np.where(finite[..., None], pixels, np.nan), factor), turns),
+        pixels=_wrapped(_light(pixels, factor), turns),
         clipped=_wrapped(_reduced(clipped, factor) > 0, turns),
         elevation=None if elevation is None else _wrapped(_reduced(elevation, factor), turns),
         from_sun=None if from_sun is None else _wrapped(_reduced(from_sun, factor), turns),
@@ -148,6 +148,13 @@ def find_sky(
         label[np.asarray(elevation) < 0] = BELOW
     label[~finite] = NOT_FINITE
     return SkyMask(label, cover)
+
+
+def _checked(pixels: np.ndarray) -> np.ndarray:
+    pixels = np.asarray(pixels, dtype=np.float32)
+    if pixels.ndim != 3 or pixels.shape[-1] != 3 or 0 in pixels.shape:
+        raise MaskError(f"pixels of shape {pixels.shape}, expected (height, width, 3)")
+    return pixels
 
 
 class _Small(NamedTuple):
@@ -218,6 +225,13 @@ def _reduced(image: np.ndarray, factor: int) -> np.ndarray:
     return tiles.mean(axis=(1, 3))
 
 
+def _light(pixels: np.ndarray, factor: int) -> np.ndarray:
+    """The picture at its working size, 1 at most; NaN where a pixel is not finite."""
+    finite = np.isfinite(pixels).all(axis=-1, keepdims=True)
+    peak = pixels.max(initial=0, where=finite)
+    return _reduced(np.where(finite, pixels / (peak if peak > 0 else 1), np.nan), factor)
+
+
 def _is_panorama(elevation: np.ndarray) -> bool:
     """Whether the picture is a full turn about the vertical: rows of one elevation that reach up to the zenith."""
     height, width = elevation.shape
@@ -241,23 +255,6 @@ def _dilated(mask: np.ndarray, radius: float) -> np.ndarray:
     from skimage import morphology
 
     return morphology.isotropic_dilation(mask, radius) if mask.any() else mask
-
-
-def _clipped(pixels: np.ndarray, saturation: float | None) -> np.ndarray:
-    """Pixels of which a channel is clipped.
-
-    A smooth maximum has, in a picture of discrete values, about as many pixels at its top value as at the next one; a clipped one
-    has many more. Channels may be clipped at different values, by a white balance that came after.
-    """
-    if saturation is not None:
-        return (pixels >= saturation).any(axis=-1)
-    clipped = np.zeros(pixels.shape[:2], dtype=bool)
-    for channel in np.moveaxis(pixels, -1, 0):
-        finite = channel[np.isfinite(channel)]
-        values, counts = np.unique(finite[finite >= 0.9 * finite.max(initial=0)], return_counts=True)
-        if values.size and values[-1] > 0 and counts[-1] >= 9 and counts[-1] > 3 * counts[-4:-1].max(initial=0):
-            clipped |= channel >= 0.985 * values[-1]
-    return clipped | np.isposinf(pixels).any(axis=-1)
 
 
 def _features(small: _Small) -> _Features:
@@ -484,12 +481,10 @@ def _is_overcast(small: _Small, seen: _Features, candidate: np.ndarray) -> bool:
 
 def find_horizon(pixels: Float[np.ndarray, "height width 3"]) -> Horizon | None:
     """The straight line where the sky meets the sea or a plain; None where there is none to be seen."""
-    pixels = np.asarray(pixels, dtype=np.float32)
+    pixels = _checked(pixels)
     factor = -(-max(pixels.shape[:2]) // WORKING_SIZE)
-    finite = np.isfinite(pixels).all(axis=-1, keepdims=True)
-    clipped = np.zeros(pixels.shape[:2], dtype=bool)
-    small = _Small(_reduced(np.where(finite, pixels, np.nan), factor), _reduced(clipped, factor) > 0, None, None, False)
-    line = _horizon(_features(small))
+    light = _light(pixels, factor)
+    line = _horizon(_features(_Small(light, np.zeros(light.shape[:2], dtype=bool), None, None, False)))
     if line is None:
         return None
     return Horizon((line.row + 0.5) * factor - 0.5, line.slope, line.confidence)
@@ -562,10 +557,11 @@ TINTS = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 0], [0.3, 0.2, 0.1], [0, 0.8, 0.2
 
 def picture(pixels: Float[np.ndarray, "height width 3"], mask: SkyMask) -> Float[np.ndarray, "height width 3"]:
     """Code values in [0, 1] for a screen: clear sky as it is, the rest dimmed and in the colour of its reason."""
-    light = np.nan_to_num(np.asarray(pixels, dtype=np.float32), nan=0.0, posinf=np.inf, neginf=0.0)
+    light = np.maximum(np.nan_to_num(_checked(pixels).astype(np.float64), nan=0.0, posinf=np.inf), 0)
     mean = light.mean(axis=-1)
     shown = np.isfinite(mean) & (mean > 0)
-    reference = np.percentile(mean[shown & mask.sky], 90) if (shown & mask.sky).any() else np.median(mean[shown]) if shown.any() else 1.0
-    codes = np.clip(-np.expm1(-np.maximum(light, 0) / reference), 0, 1) ** (1 / 2.2)
+    chosen = mean[shown & mask.sky] if (shown & mask.sky).any() else mean[shown]
+    white = np.percentile(chosen, 90) if chosen.size else 1.0
+    codes = (-np.expm1(-light / white)) ** (1 / 2.2)
     tinted = 0.5 * codes.mean(axis=-1, keepdims=True) + 0.5 * TINTS[mask.label]
     return np.where(mask.sky[..., None], codes, tinted).astype(np.float32)
