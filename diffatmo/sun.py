@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from diffatmo import ephemeris
+from diffatmo import ephemeris, saturation
 from diffatmo._types import Direction, Radiance, Scalar, Spectrum
 from diffatmo.constants import SUN_ANGULAR_RADIUS
 from diffatmo.numerics import safe_norm, safe_sqrt
@@ -163,14 +163,30 @@ class Detection(NamedTuple):
 def find(pixels: Float[np.ndarray, "height width w"], camera: Picture) -> Detection:
     """The centre of the one small, outstandingly bright spot in a picture of linear radiance.
 
-    Raises :class:`SunError` when there is none (a sky without the sun, or an image clipped around it) or more than one.
+    Where the picture is clipped around the sun it is the middle of the one round plateau, with an uncertainty in proportion to
+    the plateau's width. Raises :class:`SunError` when there is neither (a sky without the sun) or more than one.
     Runs on the host; the result is data, not differentiable.
     """
     towards = np.asarray(camera.directions(), dtype=np.float64)
     area = np.asarray(camera.solid_angles(), dtype=np.float64)
+    valid = np.asarray(camera.valid())
     # An infinite pixel is what half-precision files have where the sun was too bright for them.
     light = np.nan_to_num(np.mean(pixels, axis=-1, dtype=np.float64), nan=0.0, posinf=1e30, neginf=0.0)
-    light = np.where(np.asarray(camera.valid()), light, 0)
+    light = np.where(valid, light, 0)
+    try:
+        return _spot(light, towards, area)
+    except SunError:
+        found = _plateau(np.asarray(pixels), valid, towards, area)
+        if found is None:
+            raise
+        return found
+
+
+def _spot(
+    light: Float[np.ndarray, "height width"],
+    towards: Float[np.ndarray, "height width 3"],
+    area: Float[np.ndarray, "height width"],
+) -> Detection:
     brightest = np.unravel_index(light.argmax(), light.shape)
     peak = light[brightest]
     if peak <= 0:
@@ -193,3 +209,38 @@ def find(pixels: Float[np.ndarray, "height width w"], camera: Picture) -> Detect
     spread = np.sum(weight * np.sum((towards - centre) ** 2, axis=-1)) / np.sum(weight)
     # A centroid of light known to a pixel's width and to a half of the spot's.
     return Detection(centre, float(np.sqrt(pixel**2 / 12 + spread / 4)))
+
+
+WIDEST = np.radians(8.0)
+"""Radius of a clipped plateau beyond which it does not tell where the sun is."""
+
+LONGEST = 1.5
+"""Length by width of a plateau, up to which it is round; that of a half disc is 1.9."""
+
+
+def _plateau(
+    pixels: Float[np.ndarray, "height width w"],
+    valid: Bool[np.ndarray, "height width"],
+    towards: Float[np.ndarray, "height width 3"],
+    area: Float[np.ndarray, "height width"],
+) -> Detection | None:
+    """The middle of what is clipped, if that is one round piece in the midst of a glow; None if it is anything else."""
+    channels = [saturation.clipped(pixels[..., i : i + 1]) & valid for i in range(pixels.shape[-1])]
+    # The channel with the smallest plateau shows best where its middle is.
+    plateau = min((each for each in channels if each.any()), key=lambda each: area[each].sum(), default=None)
+    if plateau is None:
+        return None
+    size = float(area[plateau].sum())
+    centre = np.einsum("n,ni->i", area[plateau], towards[plateau])
+    centre /= max(float(np.linalg.norm(centre)), 1e-12)
+    chord = np.linalg.norm(towards - centre, axis=-1)
+    radius = np.sqrt(size / np.pi)
+    pixel = np.sqrt(area[plateau].mean())
+    offset = (towards[plateau] - centre) * np.sqrt(area[plateau] / size)[:, None]
+    long, wide, _ = np.linalg.svd(offset, compute_uv=False) if len(offset) > 2 else (0.0, 0.0, 0.0)
+    within = plateau & (chord < 1.5 * radius + pixel)
+    ring = valid & (chord > 1.5 * radius + pixel) & (chord < 2 * radius + 3 * pixel)
+    whole = 2 * np.pi * (1 - np.cos(2 * radius + 3 * pixel)) - 2 * np.pi * (1 - np.cos(1.5 * radius + pixel))
+    if radius > WIDEST or long > LONGEST * (wide + pixel / 4) or area[within].sum() < 0.97 * size or area[ring].sum() < 0.8 * whole:
+        return None
+    return Detection(centre, float(np.hypot(pixel, 0.4 * radius)))
