@@ -51,6 +51,14 @@ class ImageError(ValueError):
     """A picture cannot be read or written; the message names the file, what is wrong and what would be right."""
 
 
+class EncodedError(ImageError):
+    """A picture is not linear, and its transfer function is not stated."""
+
+
+class _Encoded(ValueError):
+    """The same before the name of the file is known."""
+
+
 class Image(NamedTuple):
     """A picture as it was read."""
 
@@ -84,6 +92,8 @@ def read_image(path: str | Path, *, transfer: str | None = None) -> Image:
         image = _reader(path)(path, transfer)
     except OSError as error:
         raise ImageError(f"{name}: cannot be read: {error.strerror or error}") from None
+    except _Encoded as error:
+        raise EncodedError(f"{name}: {error}") from error
     except ValueError as error:
         raise ImageError(f"{name}: {error}") from error
     if not np.isfinite(image.pixels).any():
@@ -134,9 +144,9 @@ def _linear(codes: np.ndarray, transfer: str | None, said: str | None, notes: Ex
         raise ValueError(f"pixels of type {codes.dtype}, expected 8 or 16 bits or floating point")
     state = 'state transfer = "srgb" or "linear"'
     if transfer is None and said not in (None, "linear"):
-        raise ValueError(f"the file says that it is encoded with {said}, not linear; {state}")
+        raise _Encoded(f"the file says that it is encoded with {said}, not linear; {state}")
     if transfer is None and codes.dtype == np.uint8 and said is None:
-        raise ValueError(f"8 bits a channel, which is as a rule not linear; {state}")
+        raise _Encoded(f"8 bits a channel, which is as a rule not linear; {state}")
     codes = exif.upright(codes, notes.orientation)
     notes = notes._replace(orientation=notes.orientation and 1, size=codes.shape[:2])
     if codes.dtype.kind == "f":

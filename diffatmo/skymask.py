@@ -175,7 +175,9 @@ def _label(small: _Small) -> tuple[np.ndarray, float]:
         if rows.size == 0:
             return label, np.nan
         part = slice(rows[0], rows[-1] + 1)
-        label[part], cover = _label_upper(_Small(*(each[part] if isinstance(each, np.ndarray) else each for each in small)))
+        label[part], cover = _label_upper(
+            _Small(*(each[part] if isinstance(each, np.ndarray) else each for each in small))
+        )
         return label, cover
     return _label_upper(small)
 
@@ -336,9 +338,7 @@ def _threshold(seen: _Features, where: np.ndarray) -> float:
 # Clear sky and clouds -------------------------------------------------------------------------------------------------
 
 
-def _clear(
-    small: _Small, seen: _Features, candidate: np.ndarray, ground: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _clear(small: _Small, seen: _Features, candidate: np.ndarray, ground: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Clear sky and cloud."""
     from skimage import measure
 

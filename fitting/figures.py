@@ -80,18 +80,20 @@ def bare(axes: Axes, title: str) -> None:
 def image_figure(
     observation: Observation, fitted: Image, residual: Image, wavelengths: Sequence[float], scale: float
 ) -> Figure:
-    """Measured and fitted side by side, and below them the relative residual of each channel (if up to three)."""
+    """Measured, what of it is used, and fitted side by side; below the relative residual of each channel, if up to three."""
     names = channels(observation, wavelengths)
     unit = " nm" if observation.bands is None else ""
     panels = {f"residual, {name}{unit}": residual[..., i] for i, name in enumerate(names)}
     if len(panels) > 3:
         panels = {"residual, mean of all channels": np.mean(residual, axis=-1)}
     height, width = observation.used.shape
-    rows = [height / width / 2, height / width / max(len(panels), 2)]
+    rows = [height / width / 3, height / width / max(len(panels), 2)]
     figure = Sheet(figsize=(10, 10 * sum(rows) + 1.1), layout="constrained")
     above, below = figure.subfigures(2, 1, height_ratios=rows, squeeze=False)[:, 0]
-    pictures = developed(observation, fitted, wavelengths)
-    for axes, picture, title in zip(above.subplots(1, 2), pictures, ("measured", "fitted"), strict=True):
+    measured, expected = developed(observation, fitted, wavelengths)
+    used = np.where(observation.used[..., None], measured, 0.3 * measured + 0.7 * np.array(_MASKED))
+    shown = {"measured": measured, "what of it is fitted": used, "fitted": expected}
+    for axes, (title, picture) in zip(above.subplots(1, 3), shown.items(), strict=True):
         axes.imshow(picture, interpolation="nearest")
         bare(axes, title)
     drawn = np.atleast_1d(below.subplots(1, len(panels)))

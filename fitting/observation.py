@@ -14,6 +14,7 @@ horizon only.
 
 import math
 from collections import Counter
+from collections.abc import Mapping
 from typing import Any, NamedTuple, Protocol
 
 import equinox as eqx
@@ -96,7 +97,7 @@ def observe(
     noise: float | np.ndarray = NOISE,
     noise_shot: float | np.ndarray = 0.0,
     noise_floor: float | np.ndarray | None = None,
-    mask: Bool[np.ndarray, "height width"] | None = None,
+    mask: Bool[np.ndarray, "height width"] | Mapping[str, Bool[np.ndarray, "height width"]] | None = None,
     saturation: float | None = None,
     sun_exclusion: float = SUN_EXCLUSION,
     view_zenith_max: float = math.pi / 2,
@@ -135,7 +136,7 @@ def observe(
         noise_shot: Variance per unit of signal (photon noise), like ``noise``.
         noise_floor: Standard deviation of a dark pixel, like ``noise``; default 1e-4 of the image's median, with a free
             pedestal of what that is above its darkest pixels.
-        mask: True where the pixel may be used.
+        mask: True where the pixel may be used; or, by reason, where it may not.
         saturation: Pixels with a channel at or above this value are not used.
         sun_exclusion: Radius, in radians, of the disc around the sun that is not used.
         view_zenith_max: Largest view zenith angle used, radians: π/2 for the sky alone, π for the ground too.
@@ -264,11 +265,13 @@ def observe(
     ]
     if saturation is not None:
         steps.append(("saturated", np.any(image >= saturation, axis=-1)))
-    if mask is not None:
-        chosen = np.asarray(mask)
-        if chosen.shape != image.shape[:2]:
-            refuse(f"mask: got shape {chosen.shape}, expected {image.shape[:2]} like the image")
-        steps.append(("masked by the user", ~chosen.astype(bool)))
+    reasons = (
+        mask if isinstance(mask, Mapping) else {} if mask is None else {"masked by the user": ~np.asarray(mask, bool)}
+    )
+    for reason, bad in reasons.items():
+        if bad.shape != image.shape[:2]:
+            refuse(f"mask: got shape {bad.shape}, expected {image.shape[:2]} like the image")
+        steps.append((reason, bad))
     steps.append(("near the sun", from_sun < sun_exclusion))
     steps.append(("near the horizon", np.abs(math.pi / 2 - zenith) < horizon_exclusion))
     used = np.ones(image.shape[:2], dtype=bool)

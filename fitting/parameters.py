@@ -352,7 +352,12 @@ def select(init: Atmosphere, free: Sequence[str], tie: Mapping[str, str] | None 
     tied = ["ozone_column"] * (DOBSON in ties.values())
     if ANGSTROM in ties.values():
         at_reference = bool(np.any(np.isclose(np.asarray(init.wavelengths), REFERENCE_NM)))
-        tied += ["mie_angstrom_exponent", *[f"mie_optical_depth_{REFERENCE_NM:g}"] * (not at_reference)]
+        tied += [
+            "mie_angstrom_exponent",
+            "visibility",
+            "turbidity",
+            *[f"mie_optical_depth_{REFERENCE_NM:g}"] * (not at_reference),
+        ]
     return Parameters(init, tuple(blocks), tuple(tied))
 
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from diffatmo import constants, spectrum
@@ -18,7 +19,7 @@ from diffatmo.atmosphere import Atmosphere
 from diffatmo.numerics import safe_log
 from fitting._errors import FitError
 from fitting.parameters import Parameters
-from fitting.quantities import DERIVED, Quantity, numbers, quantities
+from fitting.quantities import DERIVED, REFERENCE_NM, Quantity, numbers, quantities
 
 
 @dataclass(frozen=True)
@@ -168,8 +169,39 @@ def aerosol(kind: str, parameters: Parameters) -> list[Prior]:
     albedo, asymmetry, exponent = AEROSOLS[kind]
     source = f"Hess et al. 1998, {kind}"
     wanted = [
-        Prior("mie_single_scattering_albedo", albedo, 0.04, source=source),
+        Prior("mie_single_scattering_albedo", albedo, 0.04 * _repeated(parameters), source=source),
         Prior("mie_g", asymmetry, 0.04, source=source),
         Prior("mie_angstrom_exponent", exponent, 0.3, source=source),
     ]
     return [prior for prior in wanted if prior.name in (*parameters.fields, *parameters.derived)]
+
+
+def typical(parameters: Parameters, *, pressure_error: float = 0.08) -> list[Prior]:
+    """A clear sky of Earth, of which nothing is known but that it is one.
+
+    The aerosol is any of :data:`AEROSOLS`, and so are its errors (Hess, Koepke & Schult 1998, table 4); its scale height is
+    that of a boundary layer, within a factor of 1.6; ozone is its mean over Earth and seasons (Van Heuklon 1979), the ground
+    anything between the sea and dry sand. Air is that of the start, ``pressure_error`` of the logarithm for the altitude.
+    """
+    albedo, asymmetry, exponent = (np.array(column) for column in zip(*AEROSOLS.values(), strict=True))
+    opac, repeated = "Hess et al. 1998, all types", _repeated(parameters)
+    init = parameters.init
+    middle = int(np.argmin(np.abs(np.asarray(init.wavelengths) - REFERENCE_NM)))
+    air = f"rayleigh_optical_depth_{float(init.wavelengths[middle]):g}"
+    wanted = [
+        Prior("mie_single_scattering_albedo", float(albedo.mean()), float(albedo.std()) * repeated, source=opac),
+        Prior("mie_g", float(asymmetry.mean()), 0.06, source=f"{opac}, as one Henyey-Greenstein"),
+        Prior("mie_angstrom_exponent", float(exponent.mean()), float(exponent.std()), source=opac),
+        Prior("mie_scale_height", 1.5, 0.5, True, "a boundary layer"),
+        Prior("ozone_column", 300.0, 0.15, True, "Van Heuklon 1979"),
+        Prior("ground_albedo", 0.15, 0.7 * math.sqrt(init.wavelengths.size), True, "sea to sand"),
+        Prior(air, float(init.rayleigh_optical_depth[middle]), pressure_error, True, "pressure at the place"),
+    ]
+    known = {name for one in varying(parameters)[1] for name in (one.name, one.field)}
+    return [prior for prior in wanted if prior.name in known]
+
+
+def _repeated(parameters: Parameters) -> float:
+    """What the error of one number grows by where it is stated once for every wavelength."""
+    one = "mie_angstrom_exponent" in parameters.derived
+    return math.sqrt(parameters.init.wavelengths.size) if one else 1.0

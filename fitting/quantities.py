@@ -4,6 +4,7 @@ Images determine some combinations better than their factors, first of all the o
 of their own, with error bars of their own.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -34,12 +35,28 @@ def _angstrom_exponent(atmosphere: Atmosphere) -> Float[Array, ""]:
     return safe_divide(extinction[short] - extinction[long], jnp.log(bands[long] / bands[short]))
 
 
-def _optical_depth_at_reference(atmosphere: Atmosphere) -> Float[Array, ""]:
-    """Aerosol extinction optical depth at 550 nm: a power law between the wavelengths on either side."""
+def _at_reference(values: Float[Array, " w"], atmosphere: Atmosphere) -> Float[Array, ""]:
+    """A spectrum at 550 nm: a power law between the wavelengths on either side."""
     bands = atmosphere.wavelengths
     order = jnp.argsort(bands)
-    depth = safe_log(atmosphere.mie_optical_depth)[order]
-    return jnp.exp(jnp.interp(jnp.log(REFERENCE_NM), jnp.log(bands[order]), depth))
+    return jnp.exp(jnp.interp(jnp.log(REFERENCE_NM), jnp.log(bands[order]), safe_log(values)[order]))
+
+
+def _optical_depth_at_reference(atmosphere: Atmosphere) -> Float[Array, ""]:
+    """Aerosol extinction optical depth at 550 nm."""
+    return _at_reference(atmosphere.mie_optical_depth, atmosphere)
+
+
+def _visibility(atmosphere: Atmosphere) -> Float[Array, ""]:
+    """Distance at which a contrast has fallen to 2 % at the ground, at 550 nm: ln 50 / extinction (Koschmieder 1924)."""
+    at_ground = atmosphere.mie_extinction + atmosphere.rayleigh_scattering
+    return safe_divide(math.log(50), _at_reference(at_ground, atmosphere))
+
+
+def _turbidity(atmosphere: Atmosphere) -> Float[Array, ""]:
+    """Optical depth of air and aerosol over that of air, at 550 nm (Preetham, Shirley & Smits 1999, section 2.2)."""
+    air = _at_reference(atmosphere.rayleigh_optical_depth, atmosphere)
+    return 1 + safe_divide(_at_reference(atmosphere.mie_optical_depth, atmosphere), air)
 
 
 def _ozone_column(atmosphere: Atmosphere) -> Float[Array, ""]:
@@ -69,6 +86,8 @@ DERIVED = {
     ),
     f"mie_optical_depth_{REFERENCE_NM:g}": _Derived(_optical_depth_at_reference, _AEROSOL, "", False),
     "mie_angstrom_exponent": _Derived(_angstrom_exponent, _AEROSOL[:2], "", False),
+    "visibility": _Derived(_visibility, (*_AEROSOL[:2], "rayleigh_scattering"), "km", False),
+    "turbidity": _Derived(_turbidity, (*_AEROSOL, "rayleigh_scattering", "rayleigh_scale_height"), "", False),
     "ozone_column": _Derived(_ozone_column, ("ozone_absorption", "ozone_half_width"), "DU", False),
 }
 """Combinations by name."""

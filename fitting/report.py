@@ -123,10 +123,11 @@ def write(
     def png(picture: Float[np.ndarray, "height width 3"]) -> Callable[[Path], None]:
         return lambda file: imageio.write_png(file, picture, overwrite=overwrite)
 
-    def exr(pixels: Image, shot: Scene | None) -> Callable[[Path], None]:
+    def exr(pixels: Image, of: Observation, shot: Scene | None) -> Callable[[Path], None]:
         if shot is not None:
             return lambda file: scene.save(file, pixels, shot, overwrite=overwrite)
-        return lambda file: imageio.write_exr(file, pixels, wavelengths=wavelengths, overwrite=overwrite)
+        bands = wavelengths if of.bands is None else None if len(of.bands.names) == 3 else of.bands.centres
+        return lambda file: imageio.write_exr(file, pixels, wavelengths=bands, overwrite=overwrite)
 
     def chart(profile: Profile) -> Callable[[Path], None]:
         def task(file: Path) -> None:
@@ -142,9 +143,9 @@ def write(
     for name, observation, fitted, residual in zip(
         file_names(result.observations), result.observations, result.fitted, result.residuals, strict=True
     ):
-        tasks[f"fitted_{name}.exr"] = exr(fitted, scene_of(result, observation))
+        tasks[f"fitted_{name}.exr"] = exr(fitted, observation, scene_of(result, observation))
         tasks[f"fitted_{name}.png"] = png(developed(observation, fitted, wavelengths)[1])
-        tasks[f"residual_{name}.exr"] = exr(residual, None)
+        tasks[f"residual_{name}.exr"] = exr(residual, observation, None)
         tasks[f"residual_{name}.png"] = png(diverging(np.mean(residual, axis=-1), scale))
     for profile in result.profiles:
         tasks[f"profile_{profile.name}.png"] = chart(profile)
@@ -161,9 +162,10 @@ def write(
 
 
 def scene_of(result: Findings, observation: Observation) -> Scene | None:
-    """The scene of a fitted image; None if its pixels are not the camera's, or more than one exposure and the sky."""
+    """The scene of a fitted image; None if its pixels are not the camera's, or more than one exposure and the sky, or bands."""
     others = {getattr(observation, kind) for kind in KINDS if kind != "exposure"}
-    if observation.block > 1 or observation.exposure.endswith(PER_CHANNEL) or others != {FIXED}:
+    several = observation.block > 1 or observation.exposure.endswith(PER_CHANNEL) or observation.bands is not None
+    if several or others != {FIXED}:
         return None
     group = group_of(observation, "exposure")
     factor = 1.0 if group is None else result.estimate(f"exposure_{group}").value

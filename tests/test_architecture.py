@@ -70,6 +70,7 @@ LEVELS = [
     ["diffatmo.cli", "diffatmo.cli.cache", "diffatmo.cli.common", "diffatmo.cli.workers"],
     ["diffatmo.cli.keys", "diffatmo.cli.shipped", "diffatmo.cli.results"],
     ["diffatmo.cli.scenefile"],
+    ["diffatmo.cli.photo"],
     ["diffatmo.cli.images", "diffatmo.cli.origin"],
     ["diffatmo.cli.many"],
     ["diffatmo.cli.radiance", "diffatmo.cli.render", "diffatmo.cli.fit"],

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from diffatmo.cli import keys, many, shipped
+from diffatmo.cli import keys, many, photo, shipped
 from diffatmo.cli.common import (
     INTERRUPTED,
     InputError,
@@ -18,7 +18,7 @@ from diffatmo.cli.common import (
     printable,
     read_atmosphere,
 )
-from diffatmo.cli.images import observe
+from diffatmo.cli.images import observe, observe_photo, open_image
 from diffatmo.cli.scenefile import (
     FREE,
     IMAGE_KEYS,
@@ -233,6 +233,8 @@ class Job:
     max_steps: int
     starts: int | None
     profile: tuple[str, ...]
+    assumed: tuple[str, ...] = ()
+    """What was taken from photos or from experience, in words."""
 
 
 def prepare(spec: FitSpec) -> Job:
@@ -241,13 +243,28 @@ def prepare(spec: FitSpec) -> Job:
     from fitting import priors
     from fitting.parameters import select
 
-    init = read_atmosphere(spec.init or "earth")
-    free, tie = spec.free if spec.free is not None else FREE, spec.tie or {}
+    opened = [open_image(image, may_be_photo=spec.init is None) for image in spec.images]
+    # Of photos the channels are bands, unless an atmosphere says which wavelengths they shall be.
+    photos = spec.init is None and all(image.photo for image in opened)
+    pressure, pressure_error = photo.pressure(opened[0].image)
+    init = photo.start(pressure) if photos else read_atmosphere(spec.init or "earth")
+    usual, ties = (photo.FREE, photo.TIE) if photos else (FREE, {})
+    free = spec.free if spec.free is not None else usual
+    tie = (
+        spec.tie
+        if spec.tie is not None
+        else {name: kind for name, kind in ties.items() if name == "mie" or name in free}
+    )
     parameters = select(init, free, tie)
     known = [prior for table in spec.priors or () for prior in make_priors(table, parameters)]
+    if photos and spec.priors is None:
+        known = priors.typical(parameters, pressure_error=pressure_error)
     priors.collect(known, parameters)
     profile = check_profile(spec.profile or (), parameters)
-    seen = [observe(image, name, init) for image, name in zip(spec.images, image_names(spec.images), strict=True)]
+    seen = [
+        observe_photo(image, name) if photos else observe(image, name, init)
+        for image, name in zip(opened, image_names(spec.images), strict=True)
+    ]
     # Images of different atmospheres have no truth in common.
     truths = {dumps(truth): truth for truth in (image.truth for image in seen) if truth is not None}
     model = spec.model or MODELS[0]
@@ -258,10 +275,11 @@ def prepare(spec: FitSpec) -> Job:
         free=tuple(free),
         tie=tie,
         priors=known,
-        loss=spec.loss,
+        loss=spec.loss or (photo.LOSS if photos else None),
         model=model,
-        # A finer model would correct what is not wrong in images that the model itself has made.
-        refine=any(image.model != model for image in seen),
+        # A finer model would correct what is not wrong in images that the model itself has made, or what a photo cannot show.
+        refine=not photos and any(image.model != model for image in seen),
+        assumed=tuple(f"{image.observation.name}: {line}" for image in seen for line in image.assumed),
         max_steps=spec.max_steps or MAX_STEPS,
         starts=spec.starts,
         profile=profile,
@@ -344,7 +362,12 @@ def run(job: Job, directory: Path, *, overwrite: bool, quiet: bool = False, writ
     name = Text(f"\n{printable(directory.name)}", style="bold")
     console.print(name + f": {count} image{'s' * (count > 1)}, free: {', '.join(job.free)}")
 
+    for line in job.assumed:
+        console.print(f"  {line}", soft_wrap=True)
     for observation in job.observations:
+        if observation.masked:
+            left_out = ", ".join(f"{count} {reason}" for reason, count in observation.masked.items())
+            console.print(f"  {observation.name}: pixels left out: {left_out}", soft_wrap=True)
         if observation.block > 1:
             size = f"{observation.block}×{observation.block}"
             console.print(f"  {observation.name}: {observation.used.sum()} averages of {size} pixels")

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from diffatmo.cli.common import InputError
 from diffatmo.cli.keys import CAMERA_KEYS, flag_of, make_camera, with_sun
-from diffatmo.cli.scenefile import LOWEST_SUN_DEG, ImageSpec
+from diffatmo.cli.photo import ERROR, MAX_PIXELS, complete, find_mask, is_photo
+from diffatmo.cli.scenefile import LOWEST_SUN_DEG, ImageSpec, check_image_options
 
 if TYPE_CHECKING:
     import numpy as np
@@ -30,6 +31,10 @@ NUMBERS_AND_NAMES = (
     "pose",
     "focal",
     "focal_error",
+    "vignetting",
+    "vignetting_error",
+    "tone",
+    "tone_error",
     "aerosol",
     "aerosol_error",
     "aerosol_memory_h",
@@ -42,39 +47,111 @@ ANGLES = (
     "horizon_exclusion_deg",
     "sun_offset_error_deg",
     "pose_error_deg",
+    "heading_error_deg",
 )
 """What :func:`fitting.observe` takes as it is, and what it takes in radians."""
 
 SAME_WAVELENGTH_NM = 0.01
 
 
+class Opened(NamedTuple):
+    """An image as it was read."""
+
+    spec: ImageSpec
+    image: "Image"
+    shot: "Shot | None"
+    encoded: bool
+    """Whether it is not linear, and nobody has said by which transfer function; that of sRGB was undone."""
+
+    @property
+    def photo(self) -> bool:
+        """Whether its channels are bands (:mod:`diffatmo.cli.photo`)."""
+        return self.shot is None and is_photo(self.image)
+
+
 class Seen(NamedTuple):
     """An image to be fitted, and what its header says about where it comes from."""
 
     observation: "Observation"
-    truth: "Atmosphere | None"
-    model: str | None
+    truth: "Atmosphere | None" = None
+    model: str | None = None
     """That rendered it."""
+    assumed: tuple[str, ...] = ()
+    """What was assumed of a photo, in words."""
 
 
-def observe(spec: ImageSpec, name: str, init: "Atmosphere") -> Seen:
-    """The image as an observation called ``name``.
-
-    What ``spec`` does not say is taken from the image's header; what neither says is asked for.
-    """
-    import fitting
+def open_image(spec: ImageSpec, *, may_be_photo: bool) -> Opened:
+    """Read an image and its header."""
     from diffatmo import imageio, scene
 
-    options = spec.options
-    image = imageio.read_image(spec.file, transfer=options.get("transfer"))
+    stated, encoded = spec.options.get("transfer"), False
+    try:
+        image = imageio.read_image(spec.file, transfer=stated)
+    except imageio.EncodedError:
+        if not may_be_photo:
+            raise
+        image, encoded = imageio.read_image(spec.file, transfer="srgb"), True
     shot = scene.from_image(spec.file, image) if scene.ATTRIBUTE in image.metadata else None
+    return Opened(spec, image, shot, encoded)
+
+
+def observe_photo(opened: Opened, name: str) -> Seen:
+    """The photo as an observation called ``name``, with what it does not say taken from it or assumed."""
+    import numpy as np
+
+    import fitting
+    from diffatmo import bands
+
+    spec = opened.spec
+    try:
+        photo = complete(opened.image, spec.options, opened.encoded)
+        check_image_options(photo.options)
+        options = photo.options
+        camera = find_camera(options, photo.pixels, None)
+        towards = find_sun(options, photo.pixels, camera, None)
+        if "mask" in options:
+            mask: Any = read_mask(Path(options["mask"]))
+        else:
+            found = find_mask(photo.pixels, camera, towards, options)
+            mask = {reason: found.label == number for number, reason in enumerate(found.reasons) if number}
+        observation = fitting.observe(
+            photo.pixels,
+            camera=camera,
+            altitude=options["altitude_km"],
+            sun=np.asarray(towards),
+            mask=mask,
+            bands=bands.srgb(),
+            max_pixels=MAX_PIXELS,
+            name=name,
+            **stated(options),
+        )
+    except ValueError as error:
+        raise InputError(f"{spec.file}: {str(error).removeprefix(f'{name}: ')}") from error
+    if "noise" not in spec.options:
+        observation = replace(observation, noise=np.maximum(observation.noise, np.float32(ERROR)))
+    return Seen(observation, assumed=tuple(photo.assumed))
+
+
+def stated(options: Mapping[str, Any]) -> dict[str, Any]:
+    """What of ``options`` goes to :func:`fitting.observe` as it is, or in radians."""
+    chosen = {key: options[key] for key in (*NUMBERS_AND_NAMES, *NOISE_KEYS) if key in options}
+    return chosen | {key.removesuffix("_deg"): math.radians(options[key]) for key in ANGLES if key in options}
+
+
+def observe(opened: Opened, name: str, init: "Atmosphere") -> Seen:
+    """The image as an observation called ``name``.
+
+    What its options do not say is taken from its header; what neither says is asked for.
+    """
+    import fitting
+
+    spec, image, shot, _ = opened
+    options = spec.options
     try:
         pixels = in_order(image, init)
         camera, altitude = find_camera(options, pixels, shot), find_altitude(options, shot)
-        chosen: dict[str, Any] = {key: options[key] for key in NUMBERS_AND_NAMES if key in options}
-        chosen |= {key.removesuffix("_deg"): math.radians(options[key]) for key in ANGLES if key in options}
         notes = shot.notes if shot else {}
-        chosen |= {key: options.get(key, notes.get(key)) for key in NOISE_KEYS if key in options or key in notes}
+        chosen = {key: notes[key] for key in NOISE_KEYS if key in notes} | stated(options)
         observation = fitting.observe(
             pixels,
             camera=camera,

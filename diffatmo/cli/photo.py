@@ -1,0 +1,258 @@
+"""What a photograph says itself, and what has to be assumed where it does not: ``diffatmo fit PHOTO`` with no further option.
+
+A *photo* is a picture of three channels that diffatmo has not rendered. Its channels are bands, its exposure and white balance
+are unknown, and much of it is not clear sky. Nothing that is assumed here replaces what the user says, and all of it is
+reported.
+"""
+
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from diffatmo.cli.common import InputError
+from diffatmo.cli.keys import flag_of
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from diffatmo.atmosphere import Atmosphere
+    from diffatmo.camera import Camera
+    from diffatmo.exif import Exif
+    from diffatmo.imageio import Image
+    from diffatmo.skymask import SkyMask
+
+FREE = (
+    "rayleigh_scattering",
+    "mie_scattering",
+    "mie_absorption",
+    "mie_scale_height",
+    "mie_g",
+    "ozone_absorption",
+    "ground_albedo",
+)
+TIE = {"mie": "angstrom", "rayleigh_scattering": "start", "ozone_absorption": "dobson", "ground_albedo": "grey"}
+"""What is free in a photo: three bands cannot tell more of a spectrum."""
+
+LOSS = "tukey"
+ERROR = 0.03
+"""Relative error of a photo and of a uniform sky, which neighbouring pixels share: averages over pixels have it as well."""
+MAX_PIXELS = 1500
+
+EYE_LEVEL_KM = 0.002
+PANORAMA_HORIZON_DEG, PHOTO_HORIZON_DEG = 10.0, 5.0
+"""Elevation below which the air is not that of a uniform planet: haze in layers, hills, what was painted over a tripod."""
+SUN_DEG = 15.0
+
+PHONE_MM, PHONE_DIAGONAL_MM, OTHER_DIAGONAL_MM = 10.0, 6.9, 33.0
+"""Focal length of a phone's lens at most; diagonal of the sensor of a phone, and of another camera, where Exif has no
+equivalent focal length."""
+FOCAL_ERROR, POSE_ERROR_DEG, HEADING_ERROR_DEG = 0.25, 3.0, 15.0
+SATURATION = 0.98
+SCALE_HEIGHT_KM = 8.4
+"""Of pressure, for the air above a place of known altitude."""
+
+
+class Photo(NamedTuple):
+    """A picture with all that a fit needs."""
+
+    pixels: "np.ndarray"
+    """Linear, red, green and blue."""
+    options: dict[str, Any]
+    """As the user could have said them."""
+    assumed: list[str]
+    """What was taken from the picture or from experience, in words."""
+
+
+def is_photo(image: "Image") -> bool:
+    """Whether a picture's channels are bands: it has three, and does not say which wavelengths they are."""
+    return image.pixels.shape[-1] == 3 and image.wavelengths is None
+
+
+def start(pressure_hpa: float = 1013.25) -> "Atmosphere":
+    """Where the fit of a photo begins: a clear day, at the wavelengths of :mod:`diffatmo.bands`, under a sun of 1."""
+    from dataclasses import replace
+
+    import jax.numpy as jnp
+
+    from diffatmo import atmosphere, bands, spectrum
+
+    air = atmosphere.earth(bands.NODES)
+    height = 1.5
+    scattering, absorption = spectrum.angstrom_aerosol(
+        air.wavelengths, optical_depth_550=0.12, exponent=1.0, single_scattering_albedo=0.93, scale_height=height
+    )
+    return replace(
+        air,
+        solar_irradiance=jnp.ones(len(bands.NODES)),
+        rayleigh_scattering=air.rayleigh_scattering * (pressure_hpa / 1013.25),
+        mie_scattering=scattering,
+        mie_absorption=absorption,
+        mie_scale_height=jnp.asarray(height),
+        mie_g=jnp.asarray(0.74),
+        ground_albedo=jnp.full(len(bands.NODES), 0.15),
+    )
+
+
+def complete(image: "Image", options: Mapping[str, Any], encoded: bool) -> Photo:
+    """Fill in what ``options`` leave out; raises :class:`InputError` for a fact that nothing tells, naming its option.
+
+    ``encoded`` is a picture whose transfer function the user has not stated.
+    """
+    pixels, said, assumed = _srgb(image), dict(options), list[str]()
+
+    def take(key: str, value: Any, why: str = "") -> None:
+        if key not in said:
+            said[key] = value
+            if why:
+                assumed.append(why)
+
+    height, width = pixels.shape[:2]
+    _take_projection(take, said, image.exif, height, width)
+    panorama = said["projection"] == "equirectangular"
+    take("altitude_km", EYE_LEVEL_KM, f"altitude above the ground: {1000 * EYE_LEVEL_KM:g} m")
+    _take_sun(take, said, image.exif, panorama)
+    if said["projection"] == "pinhole":
+        _take_pose(take, said, image.exif, pixels)
+    if not panorama:
+        take("vignetting", "free")
+    if encoded:
+        take("tone", "free", "transfer function: about that of sRGB; a smooth tone curve is fitted besides")
+    if image.saturation is not None:
+        take("saturation", SATURATION * image.saturation)
+    if "white_balance" not in said:
+        take("exposure", "free-per-channel", "exposure and white balance: unknown, fitted")
+    take("noise", ERROR, f"errors of the photo and of a uniform sky: {100 * ERROR:g} %, common to neighbouring pixels")
+    take("sun_exclusion_deg", SUN_DEG)
+    take("horizon_exclusion_deg", PANORAMA_HORIZON_DEG if panorama else PHOTO_HORIZON_DEG)
+    return Photo(pixels, said, assumed)
+
+
+def _srgb(image: "Image") -> "np.ndarray":
+    """Linear sRGB of any picture; of a RAW through its own matrix."""
+    import numpy as np
+
+    from diffatmo.color import XYZ_TO_SRGB
+
+    if image.to_xyz is None:
+        return image.pixels
+    matrix = XYZ_TO_SRGB @ np.asarray(image.to_xyz)
+    return (image.pixels @ (matrix / matrix.sum(axis=1, keepdims=True)).T).astype(np.float32)
+
+
+def _take_projection(take: Any, said: dict[str, Any], exif: "Exif", height: int, width: int) -> None:
+    from diffatmo.exif import fov_deg
+
+    by_a_camera = any(value is not None for value in (exif.make, exif.model, exif.focal_length_mm, exif.exposure_s))
+    if "projection" not in said:
+        if "fov_deg" in said and said["fov_deg"] < 180:
+            take("projection", "pinhole")
+        elif width == 2 * height and exif.focal_length_35mm_mm is None:
+            take("projection", "equirectangular", "projection: equirectangular, as it is twice as wide as high")
+        elif width == 4 * height and not by_a_camera:
+            take(
+                "projection",
+                "equirectangular",
+                "projection: equirectangular to the horizon, as it is four times as wide as high",
+            )
+        elif by_a_camera:
+            take("projection", "pinhole")
+        else:
+            raise InputError(
+                f"projection: the file does not say how {width} x {height} pixels map to directions; give "
+                f"{flag_of('projection')}, and {flag_of('fov_deg')} unless it is a panorama"
+            )
+    if said["projection"] != "pinhole" or "fov_deg" in said:
+        return
+    known = fov_deg(exif)
+    if known is not None:
+        take("fov_deg", known[0], f"field of view: {known[0]:.1f}° high, from Exif")
+        take("focal", "free")
+        return
+    if exif.focal_length_mm is None:
+        raise InputError(
+            f"fov_deg: the file does not say; give {flag_of('fov_deg')}, from the top to the bottom of the picture"
+        )
+    phone = exif.focal_length_mm < PHONE_MM
+    diagonal = PHONE_DIAGONAL_MM if phone else OTHER_DIAGONAL_MM
+    # The longer side is that of a 4:3 sensor, however much was cut off above and below.
+    per_pixel = 0.8 * diagonal / max(width, height)
+    fov = 2 * math.degrees(math.atan(0.5 * per_pixel * height / exif.focal_length_mm))
+    kind = "a phone" if phone else "a camera"
+    take(
+        "fov_deg",
+        fov,
+        f"field of view: {fov:.0f}° high ± 25 %, of {kind} with a lens of {exif.focal_length_mm:g} mm; fitted",
+    )
+    take("focal", "free")
+    take("focal_error", FOCAL_ERROR)
+
+
+def _take_sun(take: Any, said: dict[str, Any], exif: "Exif", panorama: bool) -> None:
+    if {"sun", "time", "sun_zenith_deg", "sun_azimuth_deg"} & set(said):
+        return
+    place = exif.latitude_deg is not None and exif.longitude_deg is not None
+    if exif.time is not None and place:
+        take("time", exif.time, f"the sun: at {exif.time.isoformat()}, as Exif says")
+        take("latitude_deg", exif.latitude_deg)
+        take("longitude_deg", exif.longitude_deg)
+    elif panorama:
+        take("sun", "detect", "the sun: where it is seen in the picture")
+    else:
+        lacks = "the offset of its clock from UTC" if exif.local_time and place else "when and where it was taken"
+        raise InputError(
+            f"the sun: the file does not say {lacks}; give {flag_of('time')}, {flag_of('latitude_deg')} and "
+            f"{flag_of('longitude_deg')}, or {flag_of('sun_zenith_deg')} and {flag_of('sun_azimuth_deg')}"
+        )
+
+
+def _take_pose(take: Any, said: dict[str, Any], exif: "Exif", pixels: "np.ndarray") -> None:
+    from diffatmo.skymask import find_horizon
+
+    if "yaw_deg" not in said:
+        if exif.compass_deg is None:
+            raise InputError(
+                f"yaw_deg: the file has no compass; give {flag_of('yaw_deg')}, the azimuth of the optical axis"
+            )
+        kind = "magnetic " if exif.compass_is_magnetic else ""
+        take(
+            "yaw_deg",
+            exif.compass_deg,
+            f"azimuth: {exif.compass_deg:g}° ± {HEADING_ERROR_DEG:g}°, by the {kind}compass; fitted",
+        )
+        take("heading_error_deg", HEADING_ERROR_DEG)
+    if "pitch_deg" not in said:
+        line = find_horizon(pixels)
+        if line is None:
+            raise InputError(
+                f"pitch_deg: there is no straight horizon in the picture; give {flag_of('pitch_deg')}, the elevation of the "
+                "optical axis"
+            )
+        height = len(pixels)
+        focal = 0.5 * height / math.tan(math.radians(said["fov_deg"]) / 2)
+        roll = -math.degrees(math.atan(line.slope))
+        below = (line.row - (height - 1) / 2) * math.cos(math.radians(roll))
+        pitch = math.degrees(math.atan(below / focal))
+        take("pitch_deg", pitch, f"elevation of the axis: {pitch:.1f}°, by the horizon in row {line.row:.0f}; fitted")
+        take("roll_deg", roll)
+    take("pose", "free")
+    take("pose_error_deg", POSE_ERROR_DEG)
+
+
+def pressure(image: "Image") -> tuple[float, float]:
+    """Of the air at the place, hPa, and the error of its logarithm."""
+    if image.exif.altitude_m is None:
+        return 1013.25 * math.exp(-0.3 / SCALE_HEIGHT_KM), 0.08
+    return 1013.25 * math.exp(-max(image.exif.altitude_m, 0) / 1000 / SCALE_HEIGHT_KM), 0.02
+
+
+def find_mask(pixels: "np.ndarray", camera: "Camera", towards: "np.ndarray", options: Mapping[str, Any]) -> "SkyMask":
+    """The clear sky in a picture."""
+    import numpy as np
+
+    from diffatmo.skymask import find_sky
+
+    directions = np.asarray(camera.directions())
+    # Of a photo the pose is rough, and the horizon in it tells more.
+    elevation = np.arcsin(np.clip(directions[..., 2], -1, 1)) if options["projection"] == "equirectangular" else None
+    from_sun = np.arccos(np.clip(directions @ np.asarray(towards), -1, 1))
+    return find_sky(pixels, elevation=elevation, from_sun=from_sun, saturation=options.get("saturation"))
