@@ -18,7 +18,7 @@ ROOT = Path(__file__).parent.parent
 # __init__.py.
 LEVELS = [
     ["diffatmo._types", "diffatmo.constants", "diffatmo.compiling", "diffatmo.folders"],
-    ["diffatmo.numerics"],
+    ["diffatmo.numerics", "diffatmo.saturation"],
     ["diffatmo.ephemeris"],
     [f"diffatmo.{name}" for name in ("geometry", "phase", "table", "spectrum", "color", "codecs", "camera", "sun")],
     ["diffatmo.rays", "diffatmo.atmosphere"],
@@ -36,7 +36,7 @@ LEVELS = [
     ["diffatmo.models.moments.sky"],
     [f"diffatmo.models.{name}" for name in ("raymarch", "moments", "bruneton", "hillaire", "pathtrace")],
     ["diffatmo.models"],
-    ["diffatmo.render", "diffatmo.imageio"],
+    ["diffatmo.render", "diffatmo.imageio", "diffatmo.skymask"],
     ["diffatmo.scene", "diffatmo.comparison", "diffatmo.export"],
     ["fitting._errors"],
     ["fitting.bijections", "fitting.quantities"],
