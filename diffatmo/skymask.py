@@ -139,9 +139,9 @@ def find_sky(
         turns=turns,
     )
     found, cover = _label(small)
-    wide = found.shape[1]
-    margin = (wide - wide * 4 // 5) // 2 if turns else 0
-    label = found[:, margin : wide - margin].repeat(factor, axis=0).repeat(factor, axis=1)
+    columns = -(-pixels.shape[1] // factor)
+    margin = (found.shape[1] - columns) // 2
+    label = found[:, margin : margin + columns].repeat(factor, axis=0).repeat(factor, axis=1)
     label = label[: pixels.shape[0], : pixels.shape[1]]
     label[clipped] = SATURATED
     if elevation is not None:
@@ -175,7 +175,14 @@ def _label(small: _Small) -> tuple[np.ndarray, float]:
         if rows.size == 0:
             return label, np.nan
         part = slice(rows[0], rows[-1] + 1)
-        label[part], cover = _label_upper(_Small(*(each[part] if isinstance(each, np.ndarray) else each for each in small)))
+        label[part], cover = _label_upper(
+            small._replace(
+                pixels=small.pixels[part],
+                clipped=small.clipped[part],
+                elevation=small.elevation[part],
+                from_sun=None if small.from_sun is None else small.from_sun[part],
+            )
+        )
         return label, cover
     return _label_upper(small)
 
@@ -278,7 +285,8 @@ def _features(small: _Small) -> _Features:
         fine = filled - filters.median(filled, square, mode="nearest")
         maps.append(filled)
         rough.append((fine - _layers(fine, small, known)) ** 2)
-    return _Features(*maps, np.sqrt(_blurred(rough[0] + rough[1], 0.8 if coarse else 1.5)), lit)
+    luminance, ratio = maps
+    return _Features(luminance, ratio, np.sqrt(_blurred(rough[0] + rough[1], 0.8 if coarse else 1.5)), lit)
 
 
 # Where there can be sky -----------------------------------------------------------------------------------------------
@@ -301,7 +309,7 @@ def _height(small: _Small, above: np.ndarray) -> np.ndarray:
 
 
 def _sun(small: _Small, seen: _Features, above: np.ndarray) -> np.ndarray:
-    """The disc of the sun with its glare and the star of the lens; without its place, clipped spots that light their surroundings."""
+    """The disc of the sun and the star of the lens; without its place, clipped spots that light their surroundings."""
     from skimage import measure
 
     if small.from_sun is None:
@@ -336,9 +344,7 @@ def _threshold(seen: _Features, where: np.ndarray) -> float:
 # Clear sky and clouds -------------------------------------------------------------------------------------------------
 
 
-def _clear(
-    small: _Small, seen: _Features, candidate: np.ndarray, ground: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _clear(small: _Small, seen: _Features, candidate: np.ndarray, ground: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Clear sky and cloud."""
     from skimage import filters, measure
 
@@ -459,7 +465,7 @@ def _lower_edge(image: np.ndarray, basis: np.ndarray, where: np.ndarray) -> np.n
     there is; then not at all, where it is more than twice the scatter below.
     """
     chosen = np.flatnonzero(where.ravel())
-    chosen = chosen[:: max(1, chosen.size // 8000)]
+    chosen = chosen[:: max(1, chosen.size // 5000)]
     rows, values = basis.reshape(-1, basis.shape[-1])[chosen].astype(np.float64), image.ravel()[chosen]
     rows = rows / (scale := np.sqrt((rows**2).mean(axis=0)) + 1e-12)
     # A little stiff, but for the first function, which is the constant.
@@ -467,11 +473,13 @@ def _lower_edge(image: np.ndarray, basis: np.ndarray, where: np.ndarray) -> np.n
     weight = np.ones(values.size)
     for step in range(12):
         heavy = rows * weight[:, None]
-        factors = np.linalg.solve(heavy.T @ rows + weight.sum() * ridge, heavy.T @ values)
-        left = values - rows @ factors
+        # Sums, not matrix products: threads that wait for each other make those of this size a hundred times slower.
+        gram, right = np.einsum("ni,nj->ij", heavy, rows), np.einsum("ni,n->i", heavy, values)
+        factors = np.linalg.solve(gram + weight.sum() * ridge, right)
+        left = values - np.einsum("ni,i->n", rows, factors)
         spread = 1.4826 * float(np.median(-left[left < 0])) if (left < 0).any() else 0.0
         weight = np.where(left > 0, 0.02, 1.0) if step < 8 else np.where(left < 2 * spread + 1e-3, 1.0, 1e-9)
-    return (basis @ (factors / scale).astype(np.float32)).astype(np.float32)
+    return np.einsum("yxi,i->yx", basis, (factors / scale).astype(np.float32))
 
 
 def _basis(small: _Small) -> np.ndarray:
@@ -508,7 +516,7 @@ def _is_overcast(small: _Small, seen: _Features, candidate: np.ndarray, above: n
         return False
     ratio = _blurred(seen.ratio, 3)[sky]
     low, middle, high = np.percentile(ratio, [5, 50, 95])
-    if high - low > 0.2 or (np.ptp(height[sky]) < 0.6 or small.elevation is None) and middle < -0.2:
+    if high - low > 0.2 or ((np.ptp(height[sky]) < 0.6 or small.elevation is None) and middle < -0.2):
         return False
     slope = np.polynomial.polynomial.polyfit(height[sky], seen.luminance[sky], 1)[1]
     return bool(slope > -0.1)
