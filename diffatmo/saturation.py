@@ -16,14 +16,14 @@ def clipped(
     clipped one has many more. Channels may be clipped at different values, by a white balance that came after. An infinite
     pixel is clipped: that is what half-precision files have where the sun was too bright for them.
     """
-    infinite = np.isposinf(pixels).any(axis=-1)
+    infinite = np.asarray(np.isposinf(pixels).any(axis=-1))
     if saturation is not None:
         return infinite | (pixels >= saturation).any(axis=-1)
     plateau = np.zeros(pixels.shape[:2], dtype=bool)
     for channel in np.moveaxis(pixels, -1, 0):
         finite = channel[np.isfinite(channel)]
         peak = finite.max(initial=0)
-        values, counts = np.unique(finite[finite >= 0.9 * peak], return_counts=True)
+        counts = np.unique_counts(finite[finite >= 0.9 * peak]).counts
         if peak > 0 and counts[-1] >= LEAST and counts[-1] > 3 * counts[-4:-1].max(initial=0):
             plateau |= channel >= 0.985 * peak
     return infinite | plateau

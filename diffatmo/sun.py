@@ -241,11 +241,7 @@ def _plateau(
     within = plateau & (chord < 1.5 * radius + pixel)
     ring = valid & (chord > 1.5 * radius + pixel) & (chord < 2 * radius + 3 * pixel)
     whole = 2 * np.pi * (1 - np.cos(2 * radius + 3 * pixel)) - 2 * np.pi * (1 - np.cos(1.5 * radius + pixel))
-    if (
-        radius > WIDEST
-        or long > LONGEST * (wide + pixel / 4)
-        or area[within].sum() < 0.97 * size
-        or area[ring].sum() < 0.8 * whole
-    ):
+    round_enough = long <= LONGEST * (wide + pixel / 4) and area[within].sum() >= 0.97 * size
+    if radius > WIDEST or not round_enough or area[ring].sum() < 0.8 * whole:
         return None
     return Detection(centre, float(np.hypot(pixel, 0.4 * radius)))

@@ -18,7 +18,7 @@ ROOT = Path(__file__).parent.parent
 # __init__.py.
 LEVELS = [
     ["diffatmo._types", "diffatmo.constants", "diffatmo.compiling", "diffatmo.folders"],
-    ["diffatmo.numerics"],
+    ["diffatmo.numerics", "diffatmo.saturation"],
     ["diffatmo.ephemeris"],
     [
         f"diffatmo.{name}"
@@ -43,7 +43,7 @@ LEVELS = [
     ["diffatmo.presets.three_geospatial", "diffatmo.presets.bruneton"],
     ["diffatmo.models"],
     ["diffatmo.presets"],
-    ["diffatmo.render", "diffatmo.imageio"],
+    ["diffatmo.render", "diffatmo.imageio", "diffatmo.skymask"],
     ["diffatmo.scene", "diffatmo.comparison", "diffatmo.export"],
     ["fitting._errors"],
     ["fitting.bijections", "fitting.quantities", "fitting.mixing"],
