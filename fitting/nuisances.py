@@ -11,6 +11,7 @@ kind                numbers                                                enter
 ``focal``           the logarithm of a factor                              the directions, by the camera's projection  0 ± 5 %
 ``vignetting``      two coefficients v, of ρ² and ρ⁴                       light × exp(Σ v ρ^k)                        0 ± 0.5
 ``tone``            three coefficients of what a pixel itself says         light × exp(Σ t φ(pixel))                   0 ± 0.15
+``chroma``          one coefficient s: colours are purer, or paler         light × exp(s (1 - Y/pixel))                0 ± 0.2
 ``aerosol``         the logarithm of a factor                              the aerosol of this image                   0 ± 30 %
 ==================  =====================================================  ==========================================  ======
 
@@ -19,8 +20,8 @@ Each is fixed, free for an image of its own, or shared by a named group of image
 The first three are *linear*: given the radiance, their optimum follows (:mod:`fitting.elimination`). The others are *offsets*:
 they move the view of a sky that is solved once, but for the aerosol, with which every image has a sky of its own. An offset
 touches one image, or those of its group, and images do not mix; so the components of :data:`OFFSETS` need as many tangents
-at most, whatever the number of images. Those of *shading*, vignetting and tone, cost none: the logarithm of the light is linear
-in them, with the columns of :func:`shading`.
+at most, whatever the number of images. Those of *shading*, vignetting, tone and chroma, cost none: the logarithm of the light
+is linear in them, with the columns of :func:`shading`.
 
 *Time series.* The logarithms a of the aerosols of images at the times t are a stationary Ornstein-Uhlenbeck process, the
 continuous autoregression of first order: ⟨a a'⟩ = σ² exp(-|t - t'| / T). It is Markovian, so what is known beforehand are
@@ -42,6 +43,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from diffatmo._types import Direction
+from diffatmo.color import LUMINANCE
 from diffatmo.numerics import safe_norm
 from fitting._errors import FitError
 from fitting.observation import FIXED, FREE, PER_CHANNEL, Observation
@@ -58,14 +60,26 @@ OFFSETS = (
     ("tone", "1"),
     ("tone", "2"),
     ("tone", "3"),
+    ("chroma", "saturation"),
     ("aerosol", ""),
 )
 """Kind and component of all offsets of an image."""
 
-SUN, POSE, FOCAL, SHADING, AEROSOL = slice(0, 2), slice(2, 5), 5, slice(6, 11), 11
+SUN, POSE, FOCAL, SHADING, AEROSOL = slice(0, 2), slice(2, 5), 5, slice(6, 12), 12
 """Their places among the offsets of an image."""
 
-KINDS = ("exposure", "white_balance", "pedestal", "sun_offset", "pose", "focal", "vignetting", "tone", "aerosol")
+KINDS = (
+    "exposure",
+    "white_balance",
+    "pedestal",
+    "sun_offset",
+    "pose",
+    "focal",
+    "vignetting",
+    "tone",
+    "chroma",
+    "aerosol",
+)
 
 
 DARKEST = 1e-3
@@ -196,7 +210,8 @@ def gather(observations: Sequence[Observation], wavelengths: Sequence[float]) ->
     )
     moving = np.flatnonzero((of_offsets >= 0).any(axis=0))
     scales = [
-        1.0 if name.startswith(("vignetting_", "tone_")) else 180 / math.pi * name.endswith("_deg") for name in offsets
+        1.0 if name.startswith(("vignetting_", "tone_", "chroma_")) else 180 / math.pi * name.endswith("_deg")
+        for name in offsets
     ]
     scales = [
         0.0 if name.startswith(("focal_", "aerosol_")) else scale for name, scale in zip(offsets, scales, strict=True)
@@ -268,13 +283,23 @@ def shading(observation: Observation, kind: str, component: str) -> Float[np.nda
     """What a coefficient of shading is multiplied by in the logarithm of the light; 0 where that image has none.
 
     Of *vignetting*, powers of the distance ρ from the centre, in units of the half diagonal. Of *tone*, where the curve that
-    was undone may not have been the one that was applied: with u = ln(pixel / white), u, u²/3 and 2 pixel / white.
+    was undone may not have been the one that was applied: with u = ln(pixel / white), u, u²/3 and 2 pixel / white. Of *chroma*,
+    where the difference of a channel to the luminance Y was enlarged: 1 - Y / channel, with the channels of the picture as
+    they are.
     """
     if group_of(observation, kind) is None:
         return np.zeros_like(observation.image)
     if kind == "vignetting":
         return np.broadcast_to(observation.radius[..., None] ** int(component), observation.image.shape)
     relative = np.nan_to_num(observation.image / observation.white, posinf=1.0, neginf=0.0)
+    if kind == "chroma":
+        weights = (
+            LUMINANCE if relative.shape[-1] == len(LUMINANCE) else np.full(relative.shape[-1], 1 / relative.shape[-1])
+        )
+        luminance = np.sum(relative * weights, axis=-1, keepdims=True)
+        return np.asarray(
+            1 - luminance / np.maximum(relative, DARKEST * np.maximum(luminance, DARKEST)), dtype=np.float32
+        )
     logarithm = np.log(np.clip(relative, DARKEST, None))
     return np.asarray({"1": logarithm, "2": logarithm**2 / 3, "3": 2 * relative}[component], dtype=np.float32)
 

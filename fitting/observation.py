@@ -39,6 +39,7 @@ POSE_ERROR = math.radians(2.0)
 FOCAL_ERROR = 0.05
 VIGNETTING_ERROR = 0.5
 TONE_ERROR = 0.15
+CHROMA_ERROR = 0.2
 AEROSOL_ERROR = 0.3
 AEROSOL_MEMORY_H = 6.0
 
@@ -55,6 +56,7 @@ class Observation(eqx.Module):
     focal: str = eqx.field(static=True)
     vignetting: str = eqx.field(static=True)
     tone: str = eqx.field(static=True)
+    chroma: str = eqx.field(static=True)
     aerosol: str = eqx.field(static=True)
     sun_offset_error: float
     pose_error: float
@@ -62,6 +64,7 @@ class Observation(eqx.Module):
     focal_error: float
     vignetting_error: float
     tone_error: float
+    chroma_error: float
     aerosol_error: float
     aerosol_memory_h: float
     time_h: float | None
@@ -110,6 +113,7 @@ def observe(
     focal: str = FIXED,
     vignetting: str = FIXED,
     tone: str = FIXED,
+    chroma: str = FIXED,
     aerosol: str = FIXED,
     sun_offset_error: float = SUN_OFFSET_ERROR,
     pose_error: float = POSE_ERROR,
@@ -117,6 +121,7 @@ def observe(
     focal_error: float = FOCAL_ERROR,
     vignetting_error: float = VIGNETTING_ERROR,
     tone_error: float = TONE_ERROR,
+    chroma_error: float = CHROMA_ERROR,
     aerosol_error: float = AEROSOL_ERROR,
     aerosol_memory_h: float = AEROSOL_MEMORY_H,
     time_h: float | None = None,
@@ -162,6 +167,8 @@ def observe(
         tone: Whether pixels may have been through another tone curve than the one that was undone: ``"fixed"``, ``"free"``, or
             the name of a group that shares the three coefficients of a smooth curve. White is ``saturation``, or else the
             brightest pixel.
+        chroma: Whether the colours of the picture may have been made purer or paler, as by other primaries: ``"fixed"``,
+            ``"free"``, or the name of a group that shares one coefficient. For channels red, green, blue.
         aerosol: Whether there may be more or less aerosol than the atmosphere's, by a factor: ``"fixed"``, ``"free"``, or the
             name of a group. Each such image costs the solution of a sky of its own.
         sun_offset_error: Standard deviation of each of the sun's two angles before the image is looked at, rad.
@@ -170,6 +177,7 @@ def observe(
         focal_error: The same of the logarithm of the focal length.
         vignetting_error: The same of each coefficient of the vignetting.
         tone_error: The same of each coefficient of the tone curve.
+        chroma_error: The same of the coefficient of the chroma.
         aerosol_error: The same of the logarithm of the factor of the aerosol.
         aerosol_memory_h: Hours in which the aerosol changes: factors of images taken Δt apart are correlated by
             exp(-Δt / ``aerosol_memory_h``).
@@ -223,6 +231,7 @@ def observe(
         ("focal", focal),
         ("vignetting", vignetting),
         ("tone", tone),
+        ("chroma", chroma),
         ("aerosol", aerosol),
     ):
         refuse.unless(bool(value), key, repr(value), '"fixed", "free" or a name')
@@ -233,6 +242,7 @@ def observe(
         ("focal_error", focal_error),
         ("vignetting_error", vignetting_error),
         ("tone_error", tone_error),
+        ("chroma_error", chroma_error),
         ("aerosol_error", aerosol_error),
     ):
         if error is None:
@@ -307,6 +317,7 @@ def observe(
         focal=focal,
         vignetting=vignetting,
         tone=tone,
+        chroma=chroma,
         aerosol=aerosol,
         sun_offset_error=float(sun_offset_error),
         pose_error=float(pose_error),
@@ -314,6 +325,7 @@ def observe(
         focal_error=float(focal_error),
         vignetting_error=float(vignetting_error),
         tone_error=float(tone_error),
+        chroma_error=float(chroma_error),
         aerosol_error=float(aerosol_error),
         aerosol_memory_h=float(aerosol_memory_h),
         time_h=None if time_h is None else float(time_h),

@@ -4,7 +4,6 @@ Images determine some combinations better than their factors, first of all the o
 of their own, with error bars of their own.
 """
 
-import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -50,7 +49,7 @@ def _optical_depth_at_reference(atmosphere: Atmosphere) -> Float[Array, ""]:
 def _visibility(atmosphere: Atmosphere) -> Float[Array, ""]:
     """Distance at which a contrast has fallen to 2 % at the ground, at 550 nm: ln 50 / extinction (Koschmieder 1924)."""
     at_ground = atmosphere.mie_extinction + atmosphere.rayleigh_scattering
-    return safe_divide(math.log(50), _at_reference(at_ground, atmosphere))
+    return safe_divide(jnp.log(50.0), _at_reference(at_ground, atmosphere))
 
 
 def _turbidity(atmosphere: Atmosphere) -> Float[Array, ""]:

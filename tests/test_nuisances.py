@@ -195,7 +195,7 @@ def test_one_tangent_for_each_component_whatever_the_number_of_images():
             - 3
         )
 
-    kinds = ("pedestal", "exposure", "sun_offset", "pose", "focal", "vignetting", "tone", "aerosol")
+    kinds = ("pedestal", "exposure", "sun_offset", "pose", "focal", "vignetting", "tone", "chroma", "aerosol")
     everything = dict.fromkeys(kinds, "free")
     assert colours(3, pedestal="free", exposure="free") == 1
     assert colours(2, **everything) == colours(7, **everything) == 1 + len(OFFSETS)

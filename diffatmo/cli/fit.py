@@ -233,6 +233,7 @@ class Job:
     max_steps: int
     starts: int | None
     profile: tuple[str, ...]
+    photos: bool = False
     assumed: tuple[str, ...] = ()
     """What was taken from photos or from experience, in words."""
 
@@ -279,6 +280,7 @@ def prepare(spec: FitSpec) -> Job:
         model=model,
         # A finer model would correct what is not wrong in images that the model itself has made, or what a photo cannot show.
         refine=not photos and any(image.model != model for image in seen),
+        photos=photos,
         assumed=tuple(f"{image.observation.name}: {line}" for image in seen for line in image.assumed),
         max_steps=spec.max_steps or MAX_STEPS,
         starts=spec.starts,
@@ -338,11 +340,13 @@ def image_names(images: Sequence[ImageSpec]) -> list[str]:
     return names
 
 
-def fitting_model(name: str) -> "Model":
+def fitting_model(name: str, *, photos: bool = False) -> "Model":
     """The model called ``name``, at the resolution that fits use."""
-    from diffatmo.models import Bruneton
+    from diffatmo.models import Bruneton, Moments
 
-    return Bruneton.reduced() if name == "bruneton" else make_model(name)
+    if name == "bruneton":
+        return Bruneton.reduced()
+    return Moments.coarse() if photos and name == "moments" else make_model(name)
 
 
 def run(job: Job, directory: Path, *, overwrite: bool, quiet: bool = False, write: bool = True) -> int:
@@ -393,7 +397,7 @@ def run(job: Job, directory: Path, *, overwrite: bool, quiet: bool = False, writ
             tie=job.tie,
             priors=job.priors,
             loss=job.loss,
-            model=fitting_model(job.model),
+            model=fitting_model(job.model, photos=job.photos),
             progress=show,
             max_steps=job.max_steps,
             refine=job.refine,

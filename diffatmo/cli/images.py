@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from diffatmo.cli.common import InputError
 from diffatmo.cli.keys import CAMERA_KEYS, flag_of, make_camera, with_sun
-from diffatmo.cli.photo import ERROR, MAX_PIXELS, complete, find_mask, is_photo
+from diffatmo.cli.photo import MAX_PIXELS, complete, find_mask, is_photo, shared_noise
 from diffatmo.cli.scenefile import LOWEST_SUN_DEG, ImageSpec, check_image_options
 
 if TYPE_CHECKING:
@@ -35,6 +35,8 @@ NUMBERS_AND_NAMES = (
     "vignetting_error",
     "tone",
     "tone_error",
+    "chroma",
+    "chroma_error",
     "aerosol",
     "aerosol_error",
     "aerosol_memory_h",
@@ -128,7 +130,7 @@ def observe_photo(opened: Opened, name: str) -> Seen:
     except ValueError as error:
         raise InputError(f"{spec.file}: {str(error).removeprefix(f'{name}: ')}") from error
     if "noise" not in spec.options:
-        observation = replace(observation, noise=np.maximum(observation.noise, np.float32(ERROR)))
+        observation = replace(observation, noise=shared_noise(observation))
     return Seen(observation, assumed=tuple(photo.assumed))
 
 

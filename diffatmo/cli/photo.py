@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from diffatmo.exif import Exif
     from diffatmo.imageio import Image
     from diffatmo.skymask import SkyMask
+    from fitting import Observation
 
 FREE = (
     "rayleigh_scattering",
@@ -27,16 +28,16 @@ FREE = (
     "mie_absorption",
     "mie_scale_height",
     "mie_g",
-    "ozone_absorption",
     "ground_albedo",
 )
-TIE = {"mie": "angstrom", "rayleigh_scattering": "start", "ozone_absorption": "dobson", "ground_albedo": "grey"}
-"""What is free in a photo: three bands cannot tell more of a spectrum."""
+TIE = {"mie": "angstrom", "rayleigh_scattering": "start", "ground_albedo": "grey"}
+"""What is free in a photo: three bands of an unknown white balance cannot tell more of a spectrum, nor ozone."""
 
 LOSS = "tukey"
-ERROR = 0.03
-"""Relative error of a photo and of a uniform sky, which neighbouring pixels share: averages over pixels have it as well."""
-MAX_PIXELS = 1500
+ERROR, PATCH_SR = 0.05, 0.15
+"""Relative error of a photo and of the assumption that a sky is uniform, and the solid angle over which it is about the same,
+25° across: so residuals of clear skies look. A whole sky is 40 independent numbers in each channel, however many pixels."""
+MAX_PIXELS = 1000
 
 EYE_LEVEL_KM = 0.002
 PANORAMA_HORIZON_DEG, PHOTO_HORIZON_DEG = 10.0, 5.0
@@ -115,13 +116,18 @@ def complete(image: "Image", options: Mapping[str, Any], encoded: bool) -> Photo
         _take_pose(take, said, image.exif, pixels)
     if not panorama:
         take("vignetting", "free")
+    take("chroma", "free")
     if encoded:
         take("tone", "free", "transfer function: about that of sRGB; a smooth tone curve is fitted besides")
     if image.saturation is not None:
         take("saturation", SATURATION * image.saturation)
     if "white_balance" not in said:
         take("exposure", "free-per-channel", "exposure and white balance: unknown, fitted")
-    take("noise", ERROR, f"errors of the photo and of a uniform sky: {100 * ERROR:g} %, common to neighbouring pixels")
+    take(
+        "noise",
+        ERROR,
+        f"errors of the photo, and of a sky that is not uniform: {100 * ERROR:g} %, much the same within some 25°",
+    )
     take("sun_exclusion_deg", SUN_DEG)
     take("horizon_exclusion_deg", PANORAMA_HORIZON_DEG if panorama else PHOTO_HORIZON_DEG)
     return Photo(pixels, said, assumed)
@@ -256,3 +262,14 @@ def find_mask(pixels: "np.ndarray", camera: "Camera", towards: "np.ndarray", opt
     elevation = np.arcsin(np.clip(directions[..., 2], -1, 1)) if options["projection"] == "equirectangular" else None
     from_sun = np.arccos(np.clip(directions @ np.asarray(towards), -1, 1))
     return find_sky(pixels, elevation=elevation, from_sun=from_sun, saturation=options.get("saturation"))
+
+
+def shared_noise(observation: "Observation") -> "np.ndarray":
+    """The relative noise of as many independent pixels that determine as much as those of ``observation``."""
+    import numpy as np
+
+    angles, block = np.asarray(observation.camera.solid_angles()), observation.block
+    padded = np.pad(angles, [(0, -size % block) for size in angles.shape])
+    blocks = padded.reshape(padded.shape[0] // block, block, padded.shape[1] // block, block).sum(axis=(1, 3))
+    each = blocks[observation.used].sum() / observation.used.sum()
+    return np.maximum(observation.noise, np.float32(ERROR * math.sqrt(max(PATCH_SR / each, 1.0))))

@@ -53,6 +53,19 @@ class Moments(Model):
     view_columns: int = 16
     view_fine_columns: int = 32
 
+    @classmethod
+    def coarse(cls) -> "Moments":
+        """Four times as fast, and off by 0.5 % RMS by day and at dusk: for photographs, which are known no better."""
+        return cls(
+            altitudes=12,
+            suns=16,
+            first=Directions(sky=8, ground=4, azimuths=5, steps=6, degree=8),
+            iterate=Directions(sky=5, ground=3, azimuths=4, steps=4, degree=3),
+            last=Directions(sky=6, ground=4, azimuths=6, steps=4, degree=6),
+            view_sky=32,
+            view_ground=8,
+        )
+
     def finer(self) -> "Moments":
         """The same model at a resolution at which it agrees with Monte Carlo to some 0.03 %, at twenty times the cost."""
 
