@@ -136,11 +136,6 @@ def read(path: str | Path) -> Spectra:
         raise ScanError(f"{path}: {error}") from None
 
 
-def is_scan(path: Path) -> bool:
-    """Whether a file is named like a scan."""
-    return path.suffix.lower() in (".npz", ".csv")
-
-
 def _of_npz(data: bytes) -> dict[str, np.ndarray]:
     try:
         archive = np.load(io.BytesIO(data), allow_pickle=False)

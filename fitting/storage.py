@@ -27,6 +27,7 @@ from diffatmo.bands import Bands
 from diffatmo.camera import PROJECTIONS
 from diffatmo.models import MODELS, Model
 from diffatmo.phase import PhaseTable
+from diffatmo.scan import Scan
 from fitting._errors import FitError
 from fitting.findings import Estimate, Findings, Minimum, Profile, Setup
 from fitting.observation import Observation
@@ -52,6 +53,7 @@ _CLASSES: dict[str, Callable[..., Any]] = {
         Profile,
         Setup,
         Step,
+        Scan,
         *PROJECTIONS.values(),
     )
 }

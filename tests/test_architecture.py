@@ -71,6 +71,7 @@ LEVELS = [
     ["diffatmo.cli.keys", "diffatmo.cli.shipped", "diffatmo.cli.results"],
     ["diffatmo.cli.scenefile"],
     ["diffatmo.cli.photo"],
+    ["diffatmo.cli.scans"],
     ["diffatmo.cli.images", "diffatmo.cli.origin"],
     ["diffatmo.cli.many"],
     ["diffatmo.cli.radiance", "diffatmo.cli.render", "diffatmo.cli.fit"],

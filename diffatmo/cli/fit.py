@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from diffatmo.cli import keys, many, photo, shipped
+from diffatmo.cli import keys, many, photo, scans, shipped
 from diffatmo.cli.common import (
     INTERRUPTED,
     InputError,
@@ -18,7 +18,7 @@ from diffatmo.cli.common import (
     printable,
     read_atmosphere,
 )
-from diffatmo.cli.images import observe, observe_photo, open_image
+from diffatmo.cli.images import observe, observe_photo, open_image, stated
 from diffatmo.cli.scenefile import (
     FREE,
     IMAGE_KEYS,
@@ -244,6 +244,8 @@ def prepare(spec: FitSpec) -> Job:
     from fitting import priors
     from fitting.parameters import select
 
+    if any(scans.is_scan(image.file) for image in spec.images):
+        return prepare_scans(spec)
     opened = [open_image(image, may_be_photo=spec.init is None) for image in spec.images]
     # Of photos the channels are bands, unless an atmosphere says which wavelengths they shall be.
     photos = spec.init is None and all(image.photo for image in opened)
@@ -285,6 +287,60 @@ def prepare(spec: FitSpec) -> Job:
         max_steps=spec.max_steps or MAX_STEPS,
         starts=spec.starts,
         profile=profile,
+    )
+
+
+def prepare_scans(spec: FitSpec) -> Job:
+    """The same for measured spectra."""
+    from diffatmo import scan
+    from fitting import priors
+    from fitting.parameters import select
+
+    for image in spec.images:
+        if not scans.is_scan(image.file):
+            raise InputError(f"{image.file}: an image among scans, expected all to be spectra, or none")
+    if spec.init is not None:
+        raise InputError(
+            f"init: a scan is fitted from a start of its own, at {len(scans.NODES)} wavelengths; leave it out"
+        )
+    names = image_names(spec.images)
+    try:
+        read = [scan.read(image.file) for image in spec.images]
+        observations = [
+            scans.observe(spectra, image.options, stated(image.options), name)
+            for spectra, image, name in zip(read, spec.images, names, strict=True)
+        ]
+    except ValueError as error:
+        raise InputError(str(error)) from error
+    init = scans.start(read[0])
+    free = spec.free if spec.free is not None else scans.FREE
+    tie = (
+        spec.tie
+        if spec.tie is not None
+        else {name: kind for name, kind in scans.TIE.items() if name == "mie" or name in free}
+    )
+    parameters = select(init, free, tie)
+    known = [prior for table in spec.priors or () for prior in make_priors(table, parameters)]
+    if spec.priors is None:
+        known = priors.typical(parameters)
+    priors.collect(known, parameters)
+    return Job(
+        observations=observations,
+        init=init,
+        truth=None,
+        free=tuple(free),
+        tie=tie,
+        priors=known,
+        loss=spec.loss,
+        model=spec.model or MODELS[0],
+        refine=False,
+        max_steps=spec.max_steps or MAX_STEPS,
+        starts=spec.starts,
+        profile=check_profile(spec.profile or (), parameters),
+        photos=True,
+        assumed=tuple(
+            f"{name}: {line}" for spectra, name in zip(read, names, strict=True) for line in scans.assumed(spectra)
+        ),
     )
 
 

@@ -6,7 +6,7 @@ reported.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from diffatmo.cli.common import InputError
@@ -38,6 +38,8 @@ ERROR, PATCH_SR = 0.05, 0.15
 """Relative error of a photo and of the assumption that a sky is uniform, and the solid angle over which it is about the same,
 25° across: so residuals of clear skies look. A whole sky is 40 independent numbers in each channel, however many pixels."""
 MAX_PIXELS = 1000
+LONGEST_SIDE = 1024
+"""Of a photo, in pixels, below which it is not shrunk any further before its sky is looked for."""
 
 EYE_LEVEL_KM = 0.002
 PANORAMA_HORIZON_DEG, PHOTO_HORIZON_DEG = 10.0, 5.0
@@ -69,7 +71,7 @@ def is_photo(image: "Image") -> bool:
     return image.pixels.shape[-1] == 3 and image.wavelengths is None
 
 
-def start(pressure_hpa: float = 1013.25) -> "Atmosphere":
+def start(pressure_hpa: float = 1013.25, nodes: Sequence[float] | None = None) -> "Atmosphere":
     """Where the fit of a photo begins: a clear day, at the wavelengths of :mod:`diffatmo.bands`, under a sun of 1."""
     from dataclasses import replace
 
@@ -77,20 +79,21 @@ def start(pressure_hpa: float = 1013.25) -> "Atmosphere":
 
     from diffatmo import atmosphere, bands, spectrum
 
-    air = atmosphere.earth(bands.NODES)
+    nodes = bands.NODES if nodes is None else nodes
+    air = atmosphere.earth(nodes)
     height = 1.5
     scattering, absorption = spectrum.angstrom_aerosol(
         air.wavelengths, optical_depth_550=0.12, exponent=1.0, single_scattering_albedo=0.93, scale_height=height
     )
     return replace(
         air,
-        solar_irradiance=jnp.ones(len(bands.NODES)),
+        solar_irradiance=jnp.ones(len(nodes)),
         rayleigh_scattering=air.rayleigh_scattering * (pressure_hpa / 1013.25),
         mie_scattering=scattering,
         mie_absorption=absorption,
         mie_scale_height=jnp.asarray(height),
         mie_g=jnp.asarray(0.74),
-        ground_albedo=jnp.full(len(bands.NODES), 0.15),
+        ground_albedo=jnp.full(len(nodes), 0.15),
     )
 
 
@@ -100,6 +103,8 @@ def complete(image: "Image", options: Mapping[str, Any], encoded: bool) -> Photo
     ``encoded`` is a picture whose transfer function the user has not stated.
     """
     pixels, said, assumed = _srgb(image), dict(options), list[str]()
+    if "mask" not in said:
+        pixels = _shrunk(pixels, image.saturation)
 
     def take(key: str, value: Any, why: str = "") -> None:
         if key not in said:
@@ -143,6 +148,26 @@ def _srgb(image: "Image") -> "np.ndarray":
         return image.pixels
     matrix = XYZ_TO_SRGB @ np.asarray(image.to_xyz)
     return (image.pixels @ (matrix / matrix.sum(axis=1, keepdims=True)).T).astype(np.float32)
+
+
+def _shrunk(pixels: "np.ndarray", saturation: float | None) -> "np.ndarray":
+    """Averages over squares, few enough to go on quickly; one with a clipped pixel is clipped, and a panorama stays one."""
+    import numpy as np
+
+    height, width = pixels.shape[:2]
+    block = max(1, max(height, width) // LONGEST_SIDE)
+    while (height % block or width % block) and width in (2 * height, 4 * height):
+        block -= 1
+    if block == 1:
+        return pixels
+    rows, columns = height // block, width // block
+    squares = pixels[: rows * block, : columns * block].reshape(rows, block, columns, block, 3)
+    mean = squares.mean(axis=(1, 3), dtype=np.float64).astype(np.float32)
+    if saturation is None:
+        return mean
+    largest = squares.max(axis=(1, 3))
+    clipped = (largest >= SATURATION * saturation).any(axis=-1, keepdims=True)
+    return np.where(clipped, largest, mean)
 
 
 def _take_projection(take: Any, said: dict[str, Any], exif: "Exif", height: int, width: int) -> None:
@@ -244,9 +269,9 @@ def _take_pose(take: Any, said: dict[str, Any], exif: "Exif", pixels: "np.ndarra
     take("pose_error_deg", POSE_ERROR_DEG)
 
 
-def pressure(image: "Image") -> tuple[float, float]:
+def pressure(image: "Image | None") -> tuple[float, float]:
     """Of the air at the place, hPa, and the error of its logarithm."""
-    if image.exif.altitude_m is None:
+    if image is None or image.exif.altitude_m is None:
         return 1013.25 * math.exp(-0.3 / SCALE_HEIGHT_KM), 0.08
     return 1013.25 * math.exp(-max(image.exif.altitude_m, 0) / 1000 / SCALE_HEIGHT_KM), 0.02
 
