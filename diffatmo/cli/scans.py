@@ -24,7 +24,9 @@ NOISE, FLOOR = 0.03, 0.02
 INDEPENDENT = 6
 """Numbers of a spectrum whose errors are independent: a calibration, or an aerosol that is unlike the model's, is smooth."""
 
-SUN_DEG, POSE_ERROR_DEG, HEADING_ERROR_DEG = 13.0, 1.0, 20.0
+SUN_DEG, POSE_ERROR_DEG, HEADING_ERROR_DEG = 13.0, 1.0, 3.0
+SLIP_DEG = 45.0
+"""Angle by which an instrument's azimuth may be off."""
 
 
 def is_scan(path: Path) -> bool:
@@ -44,6 +46,32 @@ def start(spectra: "Spectra") -> "Atmosphere":
     if spectra.albedo is None:
         return air
     return replace(air, ground_albedo=jnp.asarray(np.maximum(np.interp(NODES, *spectra.albedo), 0.01), jnp.float32))
+
+
+def slip(spectra: "Spectra") -> float:
+    """By how much, rad, the instrument's azimuths are to be turned clockwise for the sky to be symmetric about the sun.
+
+    Where it is, the logarithm of the radiance is best explained by smooth functions of the angle to the sun and of the zenith
+    angle. 0 if there are too few directions to tell.
+    """
+    import numpy as np
+
+    light = np.log(np.maximum(spectra.radiance.mean(axis=1), 1e-30))
+    zenith, sun = spectra.view_zenith, spectra.sun_zenith
+    around = spectra.view_azimuth - spectra.sun_azimuth
+    turns = np.radians(np.arange(-SLIP_DEG, SLIP_DEG + 0.25, 0.5))
+    left = []
+    for turn in turns:
+        cosine = np.cos(zenith) * np.cos(sun) + np.sin(zenith) * np.sin(sun) * np.cos(around + turn)
+        angle = np.arccos(np.clip(cosine, -1, 1))
+        path = 1 / (np.cos(zenith) + 0.1)
+        columns = np.stack(
+            [np.ones_like(angle), angle, angle**2, angle**3, np.exp(-4 * angle), path, path**2, path * angle], axis=1
+        )
+        if len(columns) < 3 * columns.shape[1]:
+            return 0.0
+        left.append(float(np.sum((light - columns @ np.linalg.lstsq(columns, light, rcond=None)[0]) ** 2)))
+    return float(turns[int(np.argmin(left))])
 
 
 def observe(spectra: "Spectra", options: Mapping[str, Any], chosen: Mapping[str, Any], name: str) -> "Observation":
@@ -69,7 +97,7 @@ def observe(spectra: "Spectra", options: Mapping[str, Any], chosen: Mapping[str,
     }
     return fitting.observe(
         light[None],
-        camera=Scan(spectra.view_zenith, turned, fov=spectra.fov),
+        camera=Scan(spectra.view_zenith, turned, fov=spectra.fov, yaw=slip(spectra)),
         altitude=options.get("altitude_km", photo.EYE_LEVEL_KM),
         sun=np.asarray(sun.direction(zenith=spectra.sun_zenith.mean(), azimuth=spectra.sun_azimuth.mean())),
         bands=bands.narrow(spectra.wavelengths[kept], spectra.irradiance[kept], nodes=NODES),
@@ -80,8 +108,9 @@ def observe(spectra: "Spectra", options: Mapping[str, Any], chosen: Mapping[str,
 
 def assumed(spectra: "Spectra") -> list[str]:
     """What is taken for granted, in words."""
+    turn = f"to be turned by {math.degrees(slip(spectra)):+.1f}° ± {HEADING_ERROR_DEG:g}°"
     told = [
-        f"azimuth of the instrument: ± {HEADING_ERROR_DEG:g}°, fitted",
+        f"azimuth of the instrument: {turn}, by the symmetry of the sky; fitted",
         f"errors: {100 * NOISE:g} %, at least {100 * FLOOR:g} % of the mean, common to much of a spectrum",
     ]
     if spectra.wavelengths[-1] > LONGEST_NM:
