@@ -2,11 +2,11 @@
 
 python tests/benchmarks/cameras.py [--first 0] [--count 30] [--json FILE]
 
-Skies are drawn from what ``fitting.priors.typical`` says of a clear day, and made at 18 wavelengths by the default model, summed
-with the sensitivities of sRGB; the fit has six wavelengths and its coarse model. Cameras take turns: a linear one with an
-unknown white balance (``raw``); one that stores eight bits through a random tone curve, with vignetting, and whose compass is
-off (``jpeg``); a fisheye whose pose is 2° off (``fisheye``); a panorama with 20 % of clouds (``clouds``); and one whose sun is
-clipped in a disc of 4° (``clipped``). All have noise of 1 %.
+Skies are drawn from what ``fitting.priors.typical`` says of a clear day, made at 18 wavelengths by the default model, and
+summed with the sensitivities of sRGB; the fit has six wavelengths and its coarse model. Cameras take turns: a linear one with
+an unknown white balance (``raw``); one that stores eight bits through a random tone curve, with vignetting, and whose compass
+is off (``jpeg``); a fisheye whose pose is 2° off (``fisheye``); a panorama with 20 % of clouds (``clouds``); and one whose sun
+is clipped in a disc of 4° (``clipped``). All have noise of 1 %.
 """
 
 import argparse
