@@ -1,10 +1,10 @@
 """``diffatmo fit``: recover the parameters of an atmosphere from images of its sky."""
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
@@ -238,34 +238,58 @@ class Job:
     """What was taken from photos or from experience, in words."""
 
 
+class Choice(NamedTuple):
+    """What is fitted, whatever the images."""
+
+    init: "Atmosphere"
+    free: tuple[str, ...]
+    tie: Mapping[str, str]
+    priors: "list[Prior]"
+    profile: tuple[str, ...]
+
+
+def choose(
+    spec: FitSpec,
+    init: "Atmosphere",
+    free: Sequence[str],
+    tie: Mapping[str, str],
+    usual: "Callable[[Parameters], list[Prior]] | None" = None,
+) -> Choice:
+    """What ``spec`` says, checked, with ``free``, ``tie`` and the ``usual`` priors where it says nothing."""
+    from fitting import priors
+    from fitting.parameters import select
+
+    free = tuple(free if spec.free is None else spec.free)
+    tie = {name: kind for name, kind in tie.items() if name == "mie" or name in free} if spec.tie is None else spec.tie
+    parameters = select(init, free, tie)
+    known = [prior for table in spec.priors or () for prior in make_priors(table, parameters)]
+    if spec.priors is None and usual is not None:
+        known = usual(parameters)
+    priors.collect(known, parameters)
+    return Choice(init, free, tie, known, check_profile(spec.profile or (), parameters))
+
+
 def prepare(spec: FitSpec) -> Job:
     """Read all that ``spec`` names."""
     from diffatmo.atmosphere import dumps
     from fitting import priors
-    from fitting.parameters import select
 
     if any(scans.is_scan(image.file) for image in spec.images):
         return prepare_scans(spec)
+    if spec.init is not None:
+        # What is wrong with the fit itself is found before any image is read.
+        chosen = choose(spec, read_atmosphere(spec.init), FREE, {})
     opened = [open_image(image, may_be_photo=spec.init is None) for image in spec.images]
     # Of photos the channels are bands, unless an atmosphere says which wavelengths they shall be.
-    photos = spec.init is None and all(image.photo for image in opened)
-    pressure, pressure_error = photo.pressure(opened[0].image)
-    init = photo.start(pressure) if photos else read_atmosphere(spec.init or "earth")
-    usual, ties = (photo.FREE, photo.TIE) if photos else (FREE, {})
-    free = spec.free if spec.free is not None else usual
-    tie = (
-        spec.tie
-        if spec.tie is not None
-        else {name: kind for name, kind in ties.items() if name == "mie" or name in free}
-    )
-    parameters = select(init, free, tie)
-    known = [prior for table in spec.priors or () for prior in make_priors(table, parameters)]
-    if photos and spec.priors is None:
-        known = priors.typical(parameters, pressure_error=pressure_error)
-    priors.collect(known, parameters)
-    profile = check_profile(spec.profile or (), parameters)
+    photos = spec.init is None and bool(opened) and all(image.photo for image in opened)
+    if photos:
+        pressure, pressure_error = photo.pressure(opened[0].image)
+        usual = lambda parameters: priors.typical(parameters, pressure_error=pressure_error)
+        chosen = choose(spec, photo.start(pressure), photo.FREE, photo.TIE, usual)
+    elif spec.init is None:
+        chosen = choose(spec, read_atmosphere("earth"), FREE, {})
     seen = [
-        observe_photo(image, name) if photos else observe(image, name, init)
+        observe_photo(image, name) if photos else observe(image, name, chosen.init)
         for image, name in zip(opened, image_names(spec.images), strict=True)
     ]
     # Images of different atmospheres have no truth in common.
@@ -273,11 +297,11 @@ def prepare(spec: FitSpec) -> Job:
     model = spec.model or MODELS[0]
     return Job(
         observations=[image.observation for image in seen],
-        init=init,
+        init=chosen.init,
         truth=next(iter(truths.values())) if len(truths) == 1 else None,
-        free=tuple(free),
-        tie=tie,
-        priors=known,
+        free=chosen.free,
+        tie=chosen.tie,
+        priors=chosen.priors,
         loss=spec.loss or (photo.LOSS if photos else None),
         model=model,
         # A finer model would correct what is not wrong in images that the model itself has made, or what a photo cannot show.
@@ -286,7 +310,7 @@ def prepare(spec: FitSpec) -> Job:
         assumed=tuple(f"{image.observation.name}: {line}" for image in seen for line in image.assumed),
         max_steps=spec.max_steps or MAX_STEPS,
         starts=spec.starts,
-        profile=profile,
+        profile=chosen.profile,
     )
 
 
@@ -294,7 +318,6 @@ def prepare_scans(spec: FitSpec) -> Job:
     """The same for measured spectra."""
     from diffatmo import scan
     from fitting import priors
-    from fitting.parameters import select
 
     for image in spec.images:
         if not scans.is_scan(image.file):
@@ -312,31 +335,20 @@ def prepare_scans(spec: FitSpec) -> Job:
         ]
     except ValueError as error:
         raise InputError(str(error)) from error
-    init = scans.start(read[0])
-    free = spec.free if spec.free is not None else scans.FREE
-    tie = (
-        spec.tie
-        if spec.tie is not None
-        else {name: kind for name, kind in scans.TIE.items() if name == "mie" or name in free}
-    )
-    parameters = select(init, free, tie)
-    known = [prior for table in spec.priors or () for prior in make_priors(table, parameters)]
-    if spec.priors is None:
-        known = priors.typical(parameters)
-    priors.collect(known, parameters)
+    chosen = choose(spec, scans.start(read[0]), scans.FREE, scans.TIE, priors.typical)
     return Job(
         observations=observations,
-        init=init,
+        init=chosen.init,
         truth=None,
-        free=tuple(free),
-        tie=tie,
-        priors=known,
+        free=chosen.free,
+        tie=chosen.tie,
+        priors=chosen.priors,
         loss=spec.loss,
         model=spec.model or MODELS[0],
         refine=False,
         max_steps=spec.max_steps or MAX_STEPS,
         starts=spec.starts,
-        profile=check_profile(spec.profile or (), parameters),
+        profile=chosen.profile,
         photos=True,
         assumed=tuple(
             f"{name}: {line}" for spectra, name in zip(read, names, strict=True) for line in scans.assumed(spectra)

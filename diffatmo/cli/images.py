@@ -110,7 +110,7 @@ def observe_photo(opened: Opened, name: str) -> Seen:
         check_image_options(photo.options)
         options = photo.options
         camera = find_camera(options, photo.pixels, None)
-        towards = find_sun(options, photo.pixels, camera, None)
+        towards = _sun_of(photo.pixels, camera, options, stated="sun" in spec.options)
         if "mask" in options:
             mask: Any = read_mask(Path(options["mask"]))
         else:
@@ -132,6 +132,21 @@ def observe_photo(opened: Opened, name: str) -> Seen:
     if "noise" not in spec.options:
         observation = replace(observation, noise=shared_noise(observation))
     return Seen(observation, assumed=tuple(photo.assumed))
+
+
+def _sun_of(pixels: "np.ndarray", camera: "Camera", options: Mapping[str, Any], *, stated: bool) -> "np.ndarray":
+    """The sun of a photo; where it was ``stated`` that the picture shows it, it is refused if it does not."""
+    from diffatmo import sun
+
+    try:
+        return find_sun(options, pixels, camera, None)
+    except sun.SunError as error:
+        if stated:
+            raise
+        place = ", ".join(map(flag_of, ("time", "latitude_deg", "longitude_deg")))
+        raise InputError(
+            f"{error}; give {flag_of('sun_zenith_deg')} and {flag_of('sun_azimuth_deg')}, or {place}"
+        ) from error
 
 
 def stated(options: Mapping[str, Any]) -> dict[str, Any]:
