@@ -372,7 +372,8 @@ def test_the_sun_is_found_from_time_and_place(tmp_path, s1, start, toy):
     )
     toy_image(tmp_path / "sky.exr", s1, zenith=40)
     (seen,) = read_scene(tmp_path / "scene.toml").images
-    found = images.observe(seen, "sky", atmosphere.load(start)).observation
+    opened = images.open_image(seen, may_be_photo=False)
+    found = images.observe(opened, "sky", atmosphere.load(start)).observation
     np.testing.assert_allclose(found.sun, expected, atol=1e-6)
 
     said = ["--time", "2024-06-21T12:00:00+02:00", "--latitude-deg", "48", "--longitude-deg", "11.5"]
