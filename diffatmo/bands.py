@@ -48,7 +48,7 @@ def interpolation(nodes: Sequence[float], wavelengths: Float[np.ndarray, " n"]) 
     """
     at = np.asarray(nodes, dtype=float)
     order = np.argsort(at)
-    if at.size < 4 or np.any(np.diff(at[order]) <= 0):
+    if at.size < 4 or not np.all(np.isfinite(at)) or np.any(np.diff(at[order]) <= 0):
         raise ValueError(f"nodes: got {at.tolist()} nm, expected at least four different wavelengths")
     splines = CubicSpline(at[order], np.eye(at.size)[order], axis=0)
     return np.asarray(splines(np.asarray(wavelengths, dtype=float)))

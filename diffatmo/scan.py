@@ -18,7 +18,9 @@ columns of the same names and ``radiance_<nm>`` for every channel.
 
 import csv
 import io
+import lzma
 import math
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -39,6 +41,14 @@ FOV_DEG = 1.0
 
 MOST = 20_000_000
 """Numbers in a file at most."""
+
+
+_DAMAGE = (
+    *(ValueError, TypeError, OSError, EOFError, KeyError, RuntimeError, MemoryError),
+    *(zipfile.BadZipFile, zlib.error, lzma.LZMAError, tokenize.TokenError),
+)
+"""What NumPy and the libraries under it raise for a damaged archive; encrypted ones are a RuntimeError, and arrays that only
+claim to be large a MemoryError."""
 
 
 class ScanError(ValueError):
@@ -143,9 +153,9 @@ def _of_npz(data: bytes) -> dict[str, np.ndarray]:
         if size > 8 * MOST:
             raise ScanError(f"holds {size:,} bytes, more than the {8 * MOST:,} that are accepted")
         return {name: np.asarray(archive[name]) for name in archive}
-    except (ValueError, OSError, EOFError, KeyError, zipfile.BadZipFile, zlib.error, NotImplementedError) as error:
-        if isinstance(error, ScanError):
-            raise
+    except ScanError:
+        raise
+    except _DAMAGE:
         raise ScanError("not an .npz of plain arrays, or one that is damaged") from None
 
 
@@ -182,8 +192,8 @@ def _checked(columns: Mapping[str, np.ndarray]) -> Spectra:
         if name not in columns or columns[name].size == 0:
             raise ScanError(f"{name} is missing, expected {', '.join(needed)}")
     try:
-        numbers = {name: np.asarray(value, dtype=float) for name, value in columns.items() if name != "valid"}
-    except (ValueError, TypeError):
+        numbers = {name: value.astype(float, casting="same_kind") for name, value in columns.items()}
+    except TypeError:
         raise ScanError("expected arrays of numbers") from None
     wavelengths, radiance = numbers["wavelength_nm"], numbers["radiance"]
     lower, upper = spectrum.WAVELENGTH_RANGE
@@ -204,14 +214,17 @@ def _checked(columns: Mapping[str, np.ndarray]) -> Spectra:
         if not np.all(np.isfinite(value)) or np.any((value < lowest) | (value > limit)):
             raise ScanError(f"{name}: expected finite angles from {lowest:g} to {limit:g}")
         angles[name] = np.radians(np.broadcast_to(value, samples))
-    valid: Bool[np.ndarray, " sample"] = np.asarray(columns.get("valid", np.ones(samples)), dtype=bool)
-    if valid.shape != (samples,):
-        raise ScanError(f"valid: got shape {valid.shape}, expected one for each of {samples} samples")
+    flags = numbers.get("valid", np.ones(samples))
+    if flags.shape != (samples,):
+        raise ScanError(f"valid: got shape {flags.shape}, expected one for each of {samples} samples")
+    if not np.isin(flags, (0, 1)).all():
+        raise ScanError("valid: expected 0 or 1 for each sample")
+    valid: Bool[np.ndarray, " sample"] = flags > 0
     known = (wavelengths >= lower) & (wavelengths <= upper)
     if not valid.any() or not known.any():
         raise ScanError(f"no valid sample, or no wavelength from {lower:g} to {upper:g} nm")
     irradiance = _irradiance(numbers, wavelengths, known)
-    fov = float(numbers.get("fov_deg", np.array(FOV_DEG)).ravel()[0])
+    fov = _single(numbers, "fov_deg", FOV_DEG)
     if not 0 < fov <= 30:
         raise ScanError(f"fov_deg: got {fov:g}, expected more than 0 and at most 30")
     return Spectra(
@@ -227,13 +240,21 @@ def _checked(columns: Mapping[str, np.ndarray]) -> Spectra:
     )
 
 
+def _single(numbers: Mapping[str, np.ndarray], name: str, default: float) -> float:
+    """A number of the whole scan, which may be there for each sample."""
+    given = np.unique(numbers.get(name, np.array(default)))
+    if given.size != 1:
+        raise ScanError(f"{name}: expected one number")
+    return float(given[0])
+
+
 def _irradiance(
     numbers: Mapping[str, np.ndarray], wavelengths: np.ndarray, known: Bool[np.ndarray, " channel"]
 ) -> Float[np.ndarray, " channel"]:
     if "solar_irradiance" in numbers:
         value = numbers["solar_irradiance"]
     elif "solar_irradiance_1au" in numbers:
-        distance = float(numbers.get("earth_sun_au", np.array(1.0)).ravel()[0])
+        distance = _single(numbers, "earth_sun_au", 1.0)
         if not 0.5 < distance < 2:
             raise ScanError(f"earth_sun_au: got {distance:g}, expected about 1")
         value = numbers["solar_irradiance_1au"] / distance**2
@@ -250,7 +271,8 @@ def _albedo(numbers: Mapping[str, np.ndarray]) -> Float[np.ndarray, "2 n"] | Non
         if name in numbers:
             at = numbers.get(f"{name}_wavelength_nm", numbers["wavelength_nm"])
             value = numbers[name]
-            if at.shape != value.shape or at.ndim != 1 or np.any(np.diff(at) <= 0):
+            rises = np.all(np.isfinite(at)) and np.all(np.diff(at) > 0)
+            if at.shape != value.shape or at.ndim != 1 or not rises:
                 raise ScanError(f"{name}: expected a number for each of its wavelengths, which rise")
             if not np.all((value >= 0) & (value <= 1)):
                 raise ScanError(f"{name}: expected numbers from 0 to 1")

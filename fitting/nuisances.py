@@ -192,9 +192,8 @@ def gather(observations: Sequence[Observation], wavelengths: Sequence[float]) ->
             error = error_of(observation, kind, component)
             units[len(units) :] = [error] * (len(offsets) - len(units))
             if units[of_offsets[image, column]] != error:
-                raise FitError(
-                    f"{observation.name}: {kind}_error: got {error:g}, another image of {group!r} has another"
-                )
+                key = "heading_error" if _is_heading(observation, kind, component) else f"{kind}_error"
+                raise FitError(f"{observation.name}: {key}: got {error:g}, another image of {group!r} has another")
             if kind == "aerosol" and observation.time_h is not None:
                 times.setdefault(int(of_offsets[image, column]), []).append(observation.time_h)
     factors, pedestals = _Numbers(), _Numbers()
@@ -273,10 +272,15 @@ def _check_groups(observations: Sequence[Observation], kind: str) -> None:
 
 def error_of(observation: Observation, kind: str, component: str) -> float:
     """What is known of an offset beforehand, rad or of a logarithm."""
-    if (kind, component) == ("pose", "up_deg") and observation.heading_error is not None:
-        return observation.heading_error
-    error: float = getattr(observation, f"{kind}_error")
+    error: float = getattr(
+        observation, "heading_error" if _is_heading(observation, kind, component) else f"{kind}_error"
+    )
     return error
+
+
+def _is_heading(observation: Observation, kind: str, component: str) -> bool:
+    """Whether an offset is a turn about the vertical of which something else is known than of the others."""
+    return (kind, component) == ("pose", "up_deg") and observation.heading_error is not None
 
 
 def shading(observation: Observation, kind: str, component: str) -> Float[np.ndarray, "height width w"]:
@@ -316,8 +320,7 @@ def assumed(observations: Sequence[Observation]) -> list[tuple[str, float, float
                 continue
             error, in_degrees = error_of(observation, kind, component), component.endswith("_deg")
             factor = not component
-            heading = (kind, component) == ("pose", "up_deg") and observation.heading_error is not None
-            name = "pose_up_deg" if heading else kind + "_deg" * in_degrees
+            name = "pose_up_deg" if _is_heading(observation, kind, component) else kind + "_deg" * in_degrees
             found[name, float(factor), math.degrees(error) if in_degrees else error, factor, "each"] = None
     return list(found)
 

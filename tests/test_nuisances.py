@@ -161,6 +161,9 @@ def test_jacobian_against_differences(x64, model, zenith, parts, lenses):
         "pose": "free",
         "exposure": "free",
         "aerosol": "free",
+        "vignetting": "free",
+        "tone": "free",
+        "chroma": "free",
     }
     size = 400 if parts == 1 else 16
     images = [photo(lens, toy_sky.towards_sun(zenith), name=f"i{n}", max_pixels=size) for n, lens in enumerate(lenses)]

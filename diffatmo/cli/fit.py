@@ -210,7 +210,7 @@ def plan(images: Sequence[Path], config: Path | None, options: Mapping[str, Any]
         flag = keys.flag_of(next(iter(options)))
         raise InputError(f"{flag} describes an IMAGE, but none is given" + (f"; say it in {config}" if config else ""))
     if images:
-        check_image_options(options)
+        check_image_options(options, complete=False)
         return {output: FitSpec(tuple(ImageSpec(image, options) for image in images))}
     if config:
         return {output: read_scene(config)}

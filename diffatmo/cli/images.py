@@ -165,6 +165,7 @@ def observe(opened: Opened, name: str, init: "Atmosphere") -> Seen:
     spec, image, shot, _ = opened
     options = spec.options
     try:
+        check_image_options(options)
         pixels = in_order(image, init)
         camera, altitude = find_camera(options, pixels, shot), find_altitude(options, shot)
         notes = shot.notes if shot else {}

@@ -193,8 +193,8 @@ def check_camera_options(options: Mapping[str, Any]) -> None:
         raise InputError(f"fov_deg: got {options['fov_deg']:g}, expected less than 180 for projection pinhole")
 
 
-def check_sun_options(options: Mapping[str, Any]) -> None:
-    """Refuse a place of the sun that contradicts itself or is said in part."""
+def check_sun_options(options: Mapping[str, Any], *, complete: bool = True) -> None:
+    """Refuse a place of the sun that contradicts itself or, if it is to be ``complete``, is said in part."""
     found_by = ("time", "latitude_deg", "longitude_deg")
     said = [key for key in found_by if key in options]
     angles = [key for key in ("sun_zenith_deg", "sun_azimuth_deg") if key in options]
@@ -203,7 +203,7 @@ def check_sun_options(options: Mapping[str, Any]) -> None:
     if angles and said:
         raise InputError(f"{said[0]} contradicts {angles[0]}: the sun is found from {', '.join(found_by)}, or given")
     missing = [key for key in found_by if key not in options]
-    if said and missing:
+    if said and missing and complete:
         raise InputError(f"{missing[0]}: missing, the sun is found from {', '.join(found_by)} together")
 
 

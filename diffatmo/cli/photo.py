@@ -219,20 +219,29 @@ def _take_projection(take: Any, said: dict[str, Any], exif: "Exif", height: int,
 
 
 def _take_sun(take: Any, said: dict[str, Any], exif: "Exif", panorama: bool) -> None:
-    if {"sun", "time", "sun_zenith_deg", "sun_azimuth_deg"} & set(said):
+    if {"sun", "sun_zenith_deg", "sun_azimuth_deg"} & set(said):
         return
-    place = exif.latitude_deg is not None and exif.longitude_deg is not None
-    if exif.time is not None and place:
-        take("time", exif.time, f"the sun: at {exif.time.isoformat()}, as Exif says")
-        take("latitude_deg", exif.latitude_deg)
-        take("longitude_deg", exif.longitude_deg)
-    elif panorama:
+    from_user = {"time", "latitude_deg", "longitude_deg"} & set(said)
+    # A place is one thing: half of it is not completed by half of another.
+    placed = bool({"latitude_deg", "longitude_deg"} & from_user)
+    lacks, options = [], []
+    if "time" not in said and exif.time is None:
+        lacks.append("the offset of its clock from UTC" if exif.local_time else "when it was taken")
+        options.append(flag_of("time"))
+    if not placed and (exif.latitude_deg is None or exif.longitude_deg is None):
+        lacks.append("where it was taken")
+        options += [flag_of("latitude_deg"), flag_of("longitude_deg")]
+    if not lacks:
+        take("time", exif.time, f"the sun: at {exif.time.isoformat()}, as Exif says" if exif.time else "")
+        if not placed:
+            take("latitude_deg", exif.latitude_deg)
+            take("longitude_deg", exif.longitude_deg)
+    elif panorama and not from_user:
         take("sun", "detect", "the sun: where it is seen in the picture")
     else:
-        lacks = "the offset of its clock from UTC" if exif.local_time and place else "when and where it was taken"
         raise InputError(
-            f"the sun: the file does not say {lacks}; give {flag_of('time')}, {flag_of('latitude_deg')} and "
-            f"{flag_of('longitude_deg')}, or {flag_of('sun_zenith_deg')} and {flag_of('sun_azimuth_deg')}"
+            f"the sun: the file does not say {' nor '.join(lacks)}; give {' and '.join(options)}, or "
+            f"{flag_of('sun_zenith_deg')} and {flag_of('sun_azimuth_deg')}"
         )
 
 

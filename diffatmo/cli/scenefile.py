@@ -134,9 +134,9 @@ class FitSpec:
         return replace(self, **{key: value for key, value in given.items() if value is not None})
 
 
-def check_image_options(options: Mapping[str, Any]) -> None:
-    """Refuse options of one image that contradict each other."""
-    check_sun_options(options)
+def check_image_options(options: Mapping[str, Any], *, complete: bool = True) -> None:
+    """Refuse options of one image that contradict each other; ``complete`` ones have nothing added by what is in the file."""
+    check_sun_options(options, complete=complete)
     check_camera_options(options)
 
 
@@ -192,7 +192,7 @@ def _image(table: Mapping[str, Any], directory: Path) -> ImageSpec:
     options = {key: read(IMAGE_KEYS[key], key, value) for key, value in table.items() if key != "file"}
     if "mask" in options:
         options["mask"] = str(directory / options["mask"])
-    check_image_options(options)
+    check_image_options(options, complete=False)
     return ImageSpec(directory / file, options)
 
 
