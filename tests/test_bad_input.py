@@ -107,7 +107,8 @@ def files(tmp_path_factory):
         "prior_text.scene": 'prior = "molecular"\n[[image]]\nfile = "good.exr"\n',
         "prior_kind.scene": '[[image]]\nfile = "good.exr"\n[[prior]]\nkind = "moon"\n',
         "prior_error.scene": '[[image]]\nfile = "good.exr"\n[[prior]]\nname = "mie_g"\nvalue = 0.7\n',
-        "prior_name.scene": 'init = "earth"\n[[image]]\nfile = "good.exr"\n[[prior]]\nname = "mie_h"\nvalue = 0.7\nerror = 0.1\n',
+        "prior_name.scene": 'init = "earth"\n[[image]]\nfile = "good.exr"\n'
+        '[[prior]]\nname = "mie_h"\nvalue = 0.7\nerror = 0.1\n',
         "prior_ozone.scene": '[[image]]\nfile = "good.exr"\n[[prior]]\nkind = "ozone"\nlatitude_deg = 50\n',
         "prior_type.scene": 'init = "earth"\n[[image]]\nfile = "good.exr"\n[[prior]]\nkind = "aerosol"\ntype = "smog"\n',
         "tie_text.scene": 'tie = "grey"\n[[image]]\nfile = "good.exr"\n',
