@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from diffatmo.cli.common import InputError
 from diffatmo.cli.keys import CAMERA_KEYS, flag_of, make_camera, with_sun
-from diffatmo.cli.photo import MAX_PIXELS, complete, find_mask, is_photo, shared_noise
+from diffatmo.cli.photo import GLOW_ERROR_DEG, MAX_PIXELS, SUN_SEEN, complete, find_mask, is_photo, shared_noise
 from diffatmo.cli.scenefile import LOWEST_SUN_DEG, ImageSpec, check_image_options
 
 if TYPE_CHECKING:
@@ -102,7 +102,7 @@ def observe_photo(opened: Opened, name: str) -> Seen:
     import numpy as np
 
     import fitting
-    from diffatmo import bands
+    from diffatmo import bands, sun
 
     spec = opened.spec
     try:
@@ -110,7 +110,15 @@ def observe_photo(opened: Opened, name: str) -> Seen:
         check_image_options(photo.options)
         options = photo.options
         camera = find_camera(options, photo.pixels, None)
-        towards = _sun_of(photo.pixels, camera, options, stated="sun" in spec.options)
+        assumed = photo.assumed
+        towards, seen = _sun_of(photo.pixels, camera, options, stated="sun" in spec.options)
+        if not seen:
+            options = {"sun_offset": "free", "sun_offset_error_deg": GLOW_ERROR_DEG} | options
+            zenith, azimuth = np.degrees(sun.angles(towards))
+            where = f"{zenith:.0f}° from the zenith at azimuth {azimuth:.0f}°"
+            assumed.append(
+                f"the sun is clipped or hidden: {where} ± {GLOW_ERROR_DEG:g}°, where the sky is brightest; fitted"
+            )
         if "mask" in options:
             mask: Any = read_mask(Path(options["mask"]))
         else:
@@ -131,18 +139,27 @@ def observe_photo(opened: Opened, name: str) -> Seen:
         raise InputError(f"{spec.file}: {str(error).removeprefix(f'{name}: ')}") from error
     if "noise" not in spec.options:
         observation = replace(observation, noise=shared_noise(observation))
-    return Seen(observation, assumed=tuple(photo.assumed))
+    return Seen(observation, assumed=tuple(assumed))
 
 
-def _sun_of(pixels: "np.ndarray", camera: "Camera", options: Mapping[str, Any], *, stated: bool) -> "np.ndarray":
-    """The sun of a photo; where it was ``stated`` that the picture shows it, it is refused if it does not."""
+def _sun_of(
+    pixels: "np.ndarray", camera: "Camera", options: Mapping[str, Any], *, stated: bool
+) -> "tuple[np.ndarray, bool]":
+    """The sun of a photo, and whether it is seen, or known; if not, it is looked for where a whole sky is brightest.
+
+    Where it was ``stated`` that the picture shows the sun, it is refused if it does not.
+    """
     from diffatmo import sun
+    from diffatmo.cli.photo import glow
 
     try:
-        return find_sun(options, pixels, camera, None)
+        return find_sun(options, pixels, camera, None), True
     except sun.SunError as error:
         if stated:
             raise
+        found = glow(pixels, camera)
+        if found is not None:
+            return found, False
         place = ", ".join(map(flag_of, ("time", "latitude_deg", "longitude_deg")))
         raise InputError(
             f"{error}; give {flag_of('sun_zenith_deg')} and {flag_of('sun_azimuth_deg')}, or {place}"

@@ -50,7 +50,11 @@ PHONE_MM, PHONE_DIAGONAL_MM, OTHER_DIAGONAL_MM = 10.0, 6.9, 33.0
 """Focal length of a phone's lens at most; diagonal of the sensor of a phone, and of another camera, where Exif has no
 equivalent focal length."""
 FOCAL_ERROR, POSE_ERROR_DEG, HEADING_ERROR_DEG = 0.25, 3.0, 15.0
+SUN_SEEN = "the sun: where it is seen in the picture"
 SATURATION = 0.98
+GLOW_DEG, GLOW_ERROR_DEG, BRIGHTER = 5.0, 10.0, 1.5
+"""Radius of the brightest part of a sky whose sun is not seen as such, how far from its middle the sun may be, and how much
+brighter than the median it has to be."""
 SCALE_HEIGHT_KM = 8.4
 """Of pressure, for the air above a place of known altitude."""
 
@@ -237,7 +241,7 @@ def _take_sun(take: Any, said: dict[str, Any], exif: "Exif", panorama: bool) -> 
             take("latitude_deg", exif.latitude_deg)
             take("longitude_deg", exif.longitude_deg)
     elif panorama and not from_user:
-        take("sun", "detect", "the sun: where it is seen in the picture")
+        take("sun", "detect", SUN_SEEN)
     else:
         raise InputError(
             f"the sun: the file does not say {' nor '.join(lacks)}; give {' and '.join(options)}, or "
@@ -283,6 +287,27 @@ def pressure(image: "Image | None") -> tuple[float, float]:
     if image is None or image.exif.altitude_m is None:
         return 1013.25 * math.exp(-0.3 / SCALE_HEIGHT_KM), 0.08
     return 1013.25 * math.exp(-max(image.exif.altitude_m, 0) / 1000 / SCALE_HEIGHT_KM), 0.02
+
+
+def glow(pixels: "np.ndarray", camera: "Camera") -> "np.ndarray | None":
+    """The middle of the brightest part of the sky, some degrees across; None of a sky that is as bright everywhere."""
+    import numpy as np
+
+    directions = np.asarray(camera.directions()).reshape(-1, 3)
+    light = np.nan_to_num(pixels.mean(axis=-1), posinf=0.0, neginf=0.0).ravel()
+    light = np.where(np.isposinf(pixels).any(axis=-1).ravel(), light.max(), light)
+    above = directions[:, 2] > 0
+    if not above.any():
+        return None
+    weight = np.asarray(camera.solid_angles()).ravel()[above]
+    light, directions = light[above], directions[above]
+    # The brightest pixels that together are a disc of GLOW_DEG.
+    order = np.argsort(-light, kind="stable")
+    chosen = order[np.cumsum(weight[order]) <= 2 * np.pi * (1 - math.cos(math.radians(GLOW_DEG)))]
+    if not chosen.size or light[chosen].min() < BRIGHTER * np.median(light):
+        return None
+    middle = (weight[chosen, None] * directions[chosen]).sum(axis=0)
+    return (middle / np.linalg.norm(middle)).astype(np.float32)
 
 
 def find_mask(pixels: "np.ndarray", camera: "Camera", towards: "np.ndarray", options: Mapping[str, Any]) -> "SkyMask":
