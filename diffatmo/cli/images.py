@@ -116,6 +116,7 @@ def observe_photo(opened: Opened, name: str) -> Seen:
             options = {"sun_offset": "free", "sun_offset_error_deg": GLOW_ERROR_DEG} | options
             zenith, azimuth = np.degrees(sun.angles(towards))
             where = f"{zenith:.0f}° from the zenith at azimuth {azimuth:.0f}°"
+            assumed = [line for line in assumed if line != SUN_SEEN]
             assumed.append(
                 f"the sun is clipped or hidden: {where} ± {GLOW_ERROR_DEG:g}°, where the sky is brightest; fitted"
             )
