@@ -4,6 +4,7 @@ import io
 import math
 from collections.abc import Sequence
 from statistics import NormalDist
+from typing import Any
 
 import jax.numpy as jnp
 import matplotlib
@@ -81,6 +82,8 @@ def image_figure(
     observation: Observation, fitted: Image, residual: Image, wavelengths: Sequence[float], scale: float
 ) -> Figure:
     """Measured, what of it is used, and fitted side by side; below the relative residual of each channel, if up to three."""
+    if len(observation.image) == 1:
+        return _scan_figure(observation, fitted, residual, scale)
     names = channels(observation, wavelengths)
     unit = " nm" if observation.bands is None else ""
     panels = {f"residual, {name}{unit}": residual[..., i] for i, name in enumerate(names)}
@@ -101,6 +104,35 @@ def image_figure(
         axes.imshow(diverging(values, scale), interpolation="nearest")
         bare(axes, title)
     _residual_bar(below, list(drawn), scale)
+    return figure
+
+
+def _scan_figure(observation: Observation, fitted: Image, residual: Image, scale: float) -> Figure:
+    """Samples of a scan where they look, with their residual; the mean spectrum, and the RMS residual of each band."""
+    figure = Sheet(figsize=(10, 4.2), layout="constrained")
+    used, directions = observation.used[0], observation.directions[0]
+    azimuth, zenith = np.arctan2(directions[:, 0], directions[:, 1]), np.arccos(np.clip(directions[:, 2], -1, 1))
+    sky: Any = figure.add_subplot(1, 2, 1, projection="polar")
+    sky.set_theta_zero_location("N")
+    sky.set_theta_direction(-1)
+    sky.set_rlim(0, 90)
+    sky.plot(azimuth[~used], np.degrees(zenith[~used]), "x", color="#999", label="left out")
+    colours = diverging(np.mean(residual[0][used], axis=-1)[None], scale)[0]
+    sky.scatter(azimuth[used], np.degrees(zenith[used]), c=colours, s=60, edgecolors="#666", linewidths=0.5)
+    east, north, up = observation.sun
+    sky.plot([np.arctan2(east, north)], [np.degrees(np.arccos(up))], "*", color="#e0a000", markersize=14, label="sun")
+    sky.set_title("residual, mean of all channels", fontsize=9)
+    sky.legend(fontsize=7, loc="lower left", bbox_to_anchor=(-0.2, -0.05))
+    _residual_bar(figure, [sky], scale)
+    spectra = figure.add_subplot(1, 2, 2)
+    at = np.arange(observation.image.shape[-1]) if observation.bands is None else observation.bands.centres
+    measured, expected = observation.image[0][used], fitted[0][used]
+    spectra.plot(at, measured.mean(axis=0), color="#1f5fa8", label="measured, mean of all directions")
+    spectra.plot(at, expected.mean(axis=0), "--", color="#c2571a", label="fitted")
+    spectra.plot(at, np.sqrt(np.mean((expected - measured) ** 2, axis=0)), color="#888", label="RMS residual")
+    spectra.set_xlabel("wavelength, nm" if observation.bands is not None else "channel")
+    spectra.set_ylim(bottom=0)
+    spectra.legend(fontsize=8, frameon=False)
     return figure
 
 
