@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from few_programs import COMPILE_FAST
 
 from diffatmo import camera
 from diffatmo.camera import CameraError, Equirectangular, Fisheye, Pinhole
@@ -196,7 +197,7 @@ def test_lenses_invert_exactly_and_to_second_order(lens):
         return [getattr(inner, name) for name in names] + [inner.distortion] * bool(lens.distortion.size)
 
     # Compiled once per lens.
-    @jax.jit
+    @functools.partial(jax.jit, compiler_options=COMPILE_FAST)
     @functools.partial(jax.vmap, in_axes=(None, 0))
     def derivatives(parameters, xy):
         first = jax.jacfwd(there_and_back, argnums=(0, 1))
@@ -231,7 +232,7 @@ def test_lenses_differentiate_in_all_they_have(lens, check_jacobian):
 def test_solid_angles_are_what_pixels_cover(lens):
     x, y = jnp.meshgrid(jnp.arange(lens.width) * 1.0, jnp.arange(lens.height) * 1.0)
 
-    @jax.jit
+    @functools.partial(jax.jit, compiler_options=COMPILE_FAST)
     @jax.vmap
     def by_area(xy):
         derivative = jax.jacfwd(lambda xy: lens.directions_at(xy[0], xy[1]))(xy)

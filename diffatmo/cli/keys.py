@@ -194,7 +194,7 @@ def check_camera_options(options: Mapping[str, Any]) -> None:
 
 
 def check_sun_options(options: Mapping[str, Any], *, complete: bool = True) -> None:
-    """Refuse a place of the sun that contradicts itself or, if it is to be ``complete``, is said in part."""
+    """Refuse a place of the sun that contradicts itself or is said in part; unless ``complete``, time or place may be."""
     found_by = ("time", "latitude_deg", "longitude_deg")
     said = [key for key in found_by if key in options]
     angles = [key for key in ("sun_zenith_deg", "sun_azimuth_deg") if key in options]
@@ -202,8 +202,10 @@ def check_sun_options(options: Mapping[str, Any], *, complete: bool = True) -> N
         raise InputError(f'sun = "detect" contradicts {" and ".join(angles + said)}: give one or the other')
     if angles and said:
         raise InputError(f"{said[0]} contradicts {angles[0]}: the sun is found from {', '.join(found_by)}, or given")
-    missing = [key for key in found_by if key not in options]
-    if said and missing and complete:
+    # Of what a file may complete, a place is one thing.
+    whole = found_by if complete else tuple(key for key in found_by[1:] if set(found_by[1:]) & set(said))
+    missing = [key for key in whole if key not in options]
+    if said and missing:
         raise InputError(f"{missing[0]}: missing, the sun is found from {', '.join(found_by)} together")
 
 
