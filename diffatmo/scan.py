@@ -13,7 +13,7 @@ A file of a scan is NumPy's ``.npz`` with the arrays
 
 and, if there are, ``valid`` (samples), ``solar_irradiance`` (channels) at the time, or ``solar_irradiance_1au`` and
 ``earth_sun_au``, ``grass_albedo`` or ``ground_albedo`` with its wavelengths, ``fov_deg``; or a CSV with a row for each sample:
-columns of the same names and ``radiance_<nm>`` for every channel.
+columns of the same names as far as they have a number for each sample, and ``radiance_<nm>`` for every channel.
 """
 
 import csv
@@ -81,10 +81,18 @@ class Scan(Camera):
         *,
         fov: float = math.radians(FOV_DEG),
         yaw: float = 0.0,
+        pitch: float = 0.0,
+        roll: float = 0.0,
+        height: int = 1,
+        width: int | None = None,
     ) -> None:
-        self.zenith, self.azimuth, self.fov, self.yaw = (_array(value) for value in (zenith, azimuth, fov, yaw))
-        self.height, self.width = 1, self.zenith.size
-        self.pitch = self.roll = _array(0.0)
+        self.zenith, self.azimuth, self.fov = (_array(value) for value in (zenith, azimuth, fov))
+        self.yaw, self.pitch, self.roll = (_array(value) for value in (yaw, pitch, roll))
+        self.height, self.width = height, self.zenith.size if width is None else width
+        if (self.height, self.width) != (1, self.azimuth.size) or self.zenith.shape != self.azimuth.shape:
+            raise CameraError(
+                f"a scan of {self.zenith.shape} zenith angles and {self.azimuth.shape} azimuths, expected as many"
+            )
 
     @property
     def pixel_angle(self) -> float | Scalar:

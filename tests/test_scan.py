@@ -280,3 +280,14 @@ def test_one_line_says_what_is_wrong(name, tmp_path):
 def test_a_file_that_is_not_there(tmp_path):
     with pytest.raises(ScanError, match=r"none\.csv: cannot be read: No such file"):
         scan.read(tmp_path / "none.csv")
+
+
+def test_a_scan_is_kept_with_a_fit():
+    """Saved and read back it looks the same ways."""
+    from fitting import storage
+
+    camera = Scan(np.array([0.1, 0.7]), np.array([2.0, 5.0]), fov=0.02, yaw=0.3)
+    arrays: dict[str, np.ndarray] = {}
+    back = storage._unpack(storage._pack(camera, "camera", arrays), arrays)
+    np.testing.assert_array_equal(back.directions(), camera.directions())
+    assert (back.height, back.width) == (1, 2)

@@ -181,7 +181,7 @@ def _take_projection(take: Any, said: dict[str, Any], exif: "Exif", height: int,
     if "projection" not in said:
         if "fov_deg" in said and said["fov_deg"] < 180:
             take("projection", "pinhole")
-        elif width == 2 * height and exif.focal_length_35mm_mm is None:
+        elif width == 2 * height and exif.focal_length_35mm_mm is None and exif.focal_length_mm is None:
             take("projection", "equirectangular", "projection: equirectangular, as it is twice as wide as high")
         elif width == 4 * height and not by_a_camera:
             take(
