@@ -123,7 +123,7 @@ def test_the_file_runs_no_code_and_explains_itself(saved):
     with np.load(saved, allow_pickle=False) as file:
         np.testing.assert_array_equal(file["observations.1.image"], with_everything().observations[1].image)
         record = json.loads(file["record"].tobytes())
-    assert (record["schema"], record["schema_version"]) == ("diffatmo-result", 2)
+    assert (record["schema"], record["schema_version"]) == ("diffatmo-result", 3)
     assert record["result"]["iterations"] == with_everything().iterations
 
 
@@ -191,8 +191,8 @@ def test_other_files_are_refused(saved):
     for content in (b"not a fit", pickled(), array.getvalue(), zipped.getvalue(), npz(image=np.zeros(3))):
         assert "saved fit" in refusal(saved, content)
     assert "schema" in refusal(saved, npz(record=text({"schema": "diffatmo-fit"})))
-    newer = {"schema": storage.SCHEMA, "schema_version": 3, "version": "9.9", "result": {}}
-    assert "got 3 (diffatmo 9.9), expected 2" in refusal(saved, npz(record=text(newer)))
+    newer = {"schema": storage.SCHEMA, "schema_version": 4, "version": "9.9", "result": {}}
+    assert "got 4 (diffatmo 9.9), expected 3" in refusal(saved, npz(record=text(newer)))
     for result in ({}, {"chi2": {"type": "os.system"}}, {"model": {"type": "model", "name": "x", "fields": {}}}, 3):
         refusal(saved, npz(record=text(newer | {"schema_version": 2, "result": result})))
     refusal(saved, npz(record=np.array([3.5])))
