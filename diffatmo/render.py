@@ -107,7 +107,7 @@ def aerial_perspective(scene: Scene, depth: Float[Array, "height width"], model:
     longest = 2 * jnp.pi * (scene.atmosphere.top_radius + scene.altitude)
 
     def tile(directions: Direction, far: Length) -> Path:
-        mu, nu = directions[..., 2], directions @ scene.sun
+        mu, nu = directions[..., 2], jnp.sum(directions * scene.sun, axis=-1)
         level, mu_s = (jnp.broadcast_to(jnp.asarray(x, mu.dtype), mu.shape) for x in (scene.altitude, scene.sun[2]))
         return sky.path(altitude=level, mu=mu, mu_s=mu_s, nu=nu, distance=jnp.clip(far, 0, longest))
 

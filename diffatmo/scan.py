@@ -111,8 +111,9 @@ class Scan(Camera):
 
     def _project(self, rays: Direction) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         own = self._rays(jnp.arange(self.width), jnp.zeros(self.width))
-        nearest = jnp.argmax(rays @ own.T, axis=-1)
-        seen = jnp.max(rays @ own.T, axis=-1) >= jnp.cos(self.fov / 2)
+        cosine = jnp.matmul(rays, own.T, precision="highest")
+        nearest = jnp.argmax(cosine, axis=-1)
+        seen = jnp.max(cosine, axis=-1) >= jnp.cos(self.fov / 2)
         x = jnp.where(seen, nearest, -2).astype(rays.dtype)
         return x, jnp.zeros_like(x)
 

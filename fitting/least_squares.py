@@ -104,7 +104,7 @@ def _known_rows(y: Coordinates, problem: Problem) -> tuple[Float[Array, " k"], F
 
     def of(y: Coordinates) -> Float[Array, " k"]:
         # An offset is 0 ± 1 in its unit, or its innovation is.
-        offsets = problem.batch.nuisances.innovation @ y[size : problem.size]
+        offsets = jnp.matmul(problem.batch.nuisances.innovation, y[size : problem.size], precision="highest")
         if priors is None:
             return offsets
         return jnp.concatenate([priors.residuals(problem.parameters.atmosphere(y[:size])), offsets])

@@ -8,6 +8,7 @@ from diffatmo import geometry, rays, scattering, transmittance
 from diffatmo._types import Altitude, Cosine, Irradiance, Length, OpticalDepth
 from diffatmo.atmosphere import Atmosphere
 from diffatmo.models.base import Model, Path, Sky
+from diffatmo.numerics import whole_products
 
 
 class RayMarch(Model):
@@ -28,6 +29,7 @@ class RayMarch(Model):
             if count is not None and count < 1:
                 raise ValueError(f"{name}: got {count}, expected at least 1")
 
+    @whole_products
     def sky(self, atmosphere: Atmosphere) -> "RayMarchSky":
         """Nothing to prepare."""
         return RayMarchSky(atmosphere, self.steps, self.light_steps)
@@ -85,6 +87,7 @@ class RayMarchSky(Sky):
     steps: int = eqx.field(static=True)
     light_steps: int | None = eqx.field(static=True)
 
+    @whole_products
     def path(self, *, altitude: Altitude, mu: Cosine, mu_s: Cosine, nu: Cosine, distance: Length | None = None) -> Path:
         """Inscattered radiance and transmittance to the boundary, or to ``distance`` km if that is nearer."""
         atmosphere, radius = self.atmosphere, self.atmosphere.bottom_radius

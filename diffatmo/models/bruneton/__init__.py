@@ -16,7 +16,7 @@ from diffatmo.models.base import Model, Path, Sky
 from diffatmo.models.bruneton.precomputation import GAUSS, QUADRATURES, TRAPEZOID, Steps, Tables, look_up, precompute
 from diffatmo.models.tables import PARAMETERISATIONS, Planet, Sizes, bilinear
 from diffatmo.models.transmittance_table import SUN_ANGULAR_RADIUS, between, to_ground, to_sun, to_top
-from diffatmo.numerics import safe_divide, tiny
+from diffatmo.numerics import safe_divide, tiny, whole_products
 
 __all__ = ["Bruneton", "BrunetonSky", "Planet", "Sizes", "Steps", "Tables"]
 
@@ -73,6 +73,7 @@ class Bruneton(Model):
         radius, top = atmosphere.bottom_radius, atmosphere.top_altitude
         return Planet(radius, top, self.mu_s_min, self.sizes, self.parameterisation)
 
+    @whole_products
     def sky(self, atmosphere: Atmosphere) -> "BrunetonSky":
         """Precompute the tables."""
         planet = self.planet(atmosphere)
@@ -92,6 +93,7 @@ class BrunetonSky(Sky):
     sun_angular_radius: float = eqx.field(static=True)
     packed: bool = eqx.field(static=True)
 
+    @whole_products
     def path(self, *, altitude: Altitude, mu: Cosine, mu_s: Cosine, nu: Cosine, distance: Length | None = None) -> Path:
         """Inscattered radiance and transmittance to the boundary, or to ``distance`` km if that is nearer."""
         planet, radius, top = self.planet, self.planet.bottom_radius, self.planet.top_altitude

@@ -16,6 +16,7 @@ from diffatmo.models.base import Model, Path, Ray, Sky, View
 from diffatmo.models.hillaire.luts import Luts, SkyView, Steps, cast, compute, march
 from diffatmo.models.tables import Planet, Sizes, bilinear, taps
 from diffatmo.models.transmittance_table import SUN_ANGULAR_RADIUS, to_ground, to_sun, to_top
+from diffatmo.numerics import whole_products
 
 __all__ = ["AerialVolume", "Hillaire", "HillaireSky", "HillaireView", "Luts", "SkyView", "Steps"]
 
@@ -96,6 +97,7 @@ class HillaireSky(Sky):
         )
         return HillaireView(self, place, sun, table)
 
+    @whole_products
     def aerial_volume(
         self,
         camera: Camera,
@@ -149,6 +151,7 @@ class HillaireView(View):
     sun: Direction
     table: SkyView
 
+    @whole_products
     def radiance(self, *, view: Direction) -> Ray:
         """Radiance (ground included, sun's disc not) and transmittance along unit vectors ``view``, shape (..., 3)."""
         sky, planet, transmittance = self.sky, self.sky.planet, self.sky.luts.transmittance

@@ -28,6 +28,7 @@ from diffatmo.models.base import Model
 from diffatmo.models.moments.shell import Directions, Shell, build
 from diffatmo.models.moments.sky import MomentsSky, MomentsView, Resolution
 from diffatmo.models.moments.solve import Degrees, solve
+from diffatmo.numerics import whole_products
 
 __all__ = ["Moments", "MomentsSky", "MomentsView", "Shell"]
 
@@ -90,6 +91,7 @@ class Moments(Model):
             view_fine_columns=2 * self.view_fine_columns,
         )
 
+    @whole_products
     def shell(self, *, bottom_radius: Scalar, top_altitude: Scalar) -> Shell:
         """Geometry of a planet (km): nodes, rays and interpolation weights. A fit computes it once."""
         return build(
@@ -103,6 +105,7 @@ class Moments(Model):
             source_degree=self.source_degree,
         )
 
+    @whole_products
     def sky(self, atmosphere: Atmosphere, shell: Shell | None = None) -> MomentsSky:
         """Solve for the moments. ``shell`` is :meth:`shell` of the same planet, where it is known already."""
         if shell is None:

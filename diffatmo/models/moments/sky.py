@@ -14,7 +14,7 @@ from diffatmo.models.base import Path, Ray, Sky, View
 from diffatmo.models.moments.angular import azimuthal, degrees, orders, plane, polar
 from diffatmo.models.moments.shell import Shell, Ways, dusk
 from diffatmo.models.moments.solve import Degrees, State, gather, source_moments
-from diffatmo.numerics import safe_divide, safe_sqrt
+from diffatmo.numerics import safe_divide, safe_sqrt, whole_products
 
 ZENITH_WIDTH = 0.02
 """Least half-width of the range of nu that is tabulated, where view or sun is at the zenith, and azimuth has no meaning."""
@@ -43,6 +43,7 @@ class MomentsSky(Sky):
     state: State
     resolution: Resolution = eqx.field(static=True)
 
+    @whole_products
     def path(self, *, altitude: Altitude, mu: Cosine, mu_s: Cosine, nu: Cosine, distance: Length | None = None) -> Path:
         """Inscattered radiance and transmittance to the boundary, or to ``distance`` km if that is nearer."""
         atmosphere, radius, top = self.atmosphere, self.atmosphere.bottom_radius, self.atmosphere.top_altitude
@@ -106,6 +107,7 @@ class MomentsSky(Sky):
         value = sum(weights[..., a, None] * by_sun[first + a] for a in range(4))
         return value * dusk(mu_s, self.shell.grazing())[..., None]
 
+    @whole_products
     def view(self, *, altitude: Altitude, sun: Direction) -> "MomentsView":
         """Tabulate everything that is smooth in direction for one altitude and one sun."""
         sun = jnp.asarray(sun, jnp.result_type(sun, 1.0))
@@ -263,6 +265,7 @@ class MomentsView(View):
         weights = row_weights[..., :, None] * column_weights[..., None, :]
         return jnp.einsum("...abcw,...ab->...cw", corners, weights), row, row_weights, nu
 
+    @whole_products
     def radiance(self, *, view: Direction) -> Ray:
         """Radiance (ground included, sun's disc not) and transmittance along unit vectors ``view``, shape (..., 3)."""
         components, row, row_weights, nu = self._lookup(view)

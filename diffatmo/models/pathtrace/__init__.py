@@ -62,8 +62,9 @@ class PathTrace(Model):
     """Monte Carlo with ``samples`` paths per ray, all wavelengths on the same paths.
 
     ``samples`` is rounded up to ``replicates`` times a power of two; the standard error comes from that many independent
-    replicates. ``lanes`` paths are computed side by side, which bounds the memory. ``panels`` resolve the atmosphere
-    along a ray; 10 suit exponentials and layers some kilometres thick.
+    replicates. ``lanes`` paths are computed side by side, which bounds the memory; the default suits the cache of a
+    processor, a large GPU is busy with 2²⁰. ``panels`` resolve the atmosphere along a ray; 10 suit exponentials and layers some
+    kilometres thick.
     """
 
     samples: int = 4096
