@@ -153,11 +153,14 @@ def channels(options: Mapping[str, Any]) -> "tuple[Bands, list[str]]":
 
     if "sensitivities" not in options:
         return bands.srgb(), []
-    curves = bands.read(options["sensitivities"])
-    error = bands.node_error(curves)
-    return bands.integrated(curves.values, curves.wavelengths, names=bands.COLOURS), [
-        f"colours: by {options['sensitivities']}, to {100 * error:.2g} % at the wavelengths of the model"
-    ]
+    file = options["sensitivities"]
+    curves = bands.read(file)
+    try:
+        seen = bands.integrated(curves.values, curves.wavelengths, names=bands.COLOURS)
+    except ValueError as error:
+        raise InputError(f"{file}: {error}") from error
+    off = bands.node_error(curves)
+    return seen, [f"colours: by {file}; the wavelengths of the model show them to {100 * off:.2g} %"]
 
 
 def _to_xyz(image: "Image", options: Mapping[str, Any]) -> "np.ndarray | None":
