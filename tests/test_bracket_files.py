@@ -1,6 +1,7 @@
 """Brackets from files: what they show is the truth within the noise that goes into the fit, and mistaken ones are refused."""
 
 import dataclasses
+import math
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -137,6 +138,19 @@ def test_photos_say_their_exposures_themselves(tmp_path):
     # Steps of eight bits are a third of the noise, which the median does not see.
     assert np.median(np.abs(pulls)) == pytest.approx(0.6745, rel=0.1)
     assert image.saturation == pytest.approx(1 / 0.01)
+    # That they agree says that the curve which was undone is the one that was applied.
+    assert opened.spec.options["tone_error"] < 0.03
+
+
+@pytest.mark.parametrize("exponent", [1.0, 1.1, 0.8])
+def test_exposures_tell_a_transfer_function_that_is_wrong(exponent):
+    """Of a picture that went through a power of its light the ratio of two exposures is that power of the stated one."""
+    shown = np.geomspace(1, 20, 3000).reshape(20, 50, 3)
+    pictures = [(np.minimum(t * shown, 1) ** exponent).astype(np.float32) for t in (0.02, 0.1)]
+    taken = [Image(picture, {}, None, saturation=1.0) for picture in pictures]
+    merged = bracket.merge([Path("a"), Path("b")], taken, {"exposure_s": [0.02, 0.1]})
+    assert merged.tone_error == pytest.approx(max(abs(exponent - 1), 0.01), rel=1e-3)
+    assert merged.told.endswith(f"they agree to {100 * abs(exponent - 1) * math.log(5):.1f} %")
 
 
 def test_a_merged_photo_goes_into_a_fit_with_its_noise(tmp_path):
@@ -235,7 +249,7 @@ def test_rendered_files_know_their_exposures(tmp_path, s1):
 TIME = datetime(2024, 6, 21, 10, 30, tzinfo=UTC)
 NOTES = Exif(exposure_s=0.01, iso=100, f_number=1.0, model="X", lens="L", focal_length_mm=24.0, focal_length_35mm_mm=36.0,
              compass_deg=359.5, latitude_deg=48.0, longitude_deg=11.0, time=TIME)  # fmt: skip
-FLAT = np.full((2, 4, 3), 0.05, np.float32)
+FLAT = np.full((2, 4, 3), 0.06, np.float32)
 
 
 def taken(level=1.0, *, pixels=FLAT, exif=None, **others):
@@ -281,7 +295,7 @@ def test_small_differences_are_none():
     """Of a compass that trembles about north, half a minute later."""
     other = differing(compass_deg=0.3, time=TIME + timedelta(seconds=30))
     merged = bracket.merge([Path("a"), Path("b")], [taken(), other], {}).image
-    np.testing.assert_allclose(merged.pixels, 5, rtol=1e-6)
+    np.testing.assert_allclose(merged.pixels, 6, rtol=1e-6)
 
 
 def test_files_tell_how_they_were_turned(tmp_path):

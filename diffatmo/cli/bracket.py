@@ -4,6 +4,7 @@
 exposures of one view at all.
 """
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from datetime import timedelta
 from itertools import pairwise
@@ -28,8 +29,22 @@ COMPASS_DEG, PLACE_DEG, TIME = 2.0, 1e-3, timedelta(minutes=5)
 MOST_APART = 2.0
 """Factor between what two exposures say of one light, beyond which exposures or pictures are mistaken."""
 
-LOWEST, HIGHEST = 0.02, 0.9
+LOWEST, HIGHEST = 0.05, 0.9
 """Of what a pixel can hold: where two exposures are compared."""
+
+PARTS, PART_SIZE = 8, 100
+"""From dark to bright they are compared in so many parts at most, of so many pixels at least."""
+
+LEAST_TONE_ERROR = 0.01
+
+
+class Agreement(NamedTuple):
+    """How well two exposures agree on the light, where they do worst: medians over pixels that are about as bright."""
+
+    apart: float
+    """Logarithm of the ratio of what they say of it."""
+    exponent: float
+    """Error of the exponent of a transfer function, if that is why."""
 
 
 class Merged(NamedTuple):
@@ -39,6 +54,8 @@ class Merged(NamedTuple):
     """Light per unit of exposure, with its noise; a pixel that is clipped in all files is at ``image.saturation``."""
     told: str
     """What was merged, in words."""
+    tone_error: float | None
+    """How well the exposures together know the transfer function that was undone (``tone_error``); None if they say nothing."""
 
 
 def merge(
@@ -78,7 +95,7 @@ def merge(
         )
     except ValueError as error:
         raise InputError(f"{files[0]}: {error}") from error
-    apart = _check_exposures(files, pictures, exposures, white)
+    found = _check_exposures(files, pictures, exposures, white)
     # What is lost in the noise of the shortest exposure is far from its saturation.
     shortest = pictures[int(np.argmin(exposures))]
     brightest = white / min(exposures)
@@ -87,8 +104,9 @@ def merge(
         pixels=np.where(clipped, np.float32(brightest), light), noise=np.nan_to_num(noise), saturation=float(brightest)
     )
     span = f"{min(exposures):g} to {max(exposures):g} s"
-    agreement = "" if apart is None else f"; where two show the same, they agree to {100 * (apart - 1):.2g} %"
-    return Merged(image, f"merged from {len(files)} files, exposed {span}{agreement}")
+    agreement = f"; where two show the same, they agree to {100 * found.apart:.1f} %" if found else ""
+    tone_error = min(max(found.exponent, LEAST_TONE_ERROR), 1.0) if found else None
+    return Merged(image, f"merged from {len(files)} files, exposed {span}{agreement}", tone_error)
 
 
 def _check_same(first: Path, image: "Image", file: Path, other: "Image") -> None:
@@ -139,24 +157,28 @@ def _exposure(file: Path, exif: "Exif") -> float:
 
 def _check_exposures(
     files: Sequence[Path], pictures: "Sequence[np.ndarray]", exposures: Sequence[float], white: float
-) -> float | None:
-    """The largest factor by which neighbouring exposures disagree on the light (median over pixels); None if nothing tells."""
+) -> Agreement | None:
+    """How well neighbouring exposures agree on the light; None if no pixel is exposed well in both of two.
+
+    Raises :class:`InputError` where they do not at all.
+    """
     import numpy as np
 
     order = np.argsort(exposures)
-    worst = None
+    found = []
     for shorter, longer in pairwise(order):
-        low, high = pictures[shorter], pictures[longer]
-        both = (low > LOWEST * white) & (high > LOWEST * white) & (low < HIGHEST * white) & (high < HIGHEST * white)
+        low, high = pictures[shorter] / white, pictures[longer] / white
+        both = (low > LOWEST) & (high > LOWEST) & (low < HIGHEST) & (high < HIGHEST)
         if not both.any():
             continue
-        seen = float(np.median(high[both] / low[both]))
         stated = exposures[longer] / exposures[shorter]
-        apart = max(seen / stated, stated / seen)
-        if apart > MOST_APART:
+        ratio = (high[both] / low[both])[np.argsort(high[both])]
+        if not 1 / MOST_APART < np.median(ratio) / stated < MOST_APART:
             raise InputError(
-                f"{files[longer]}: {seen:.3g} times as bright as {files[shorter]}, where both are exposed well, but by their "
-                f"exposures it would be {stated:.3g} times; expected the exposures in the order of the files"
+                f"{files[longer]}: {np.median(ratio):.3g} times as bright as {files[shorter]}, where both are exposed well, "
+                f"but by their exposures it would be {stated:.3g} times; expected the exposures in the order of the files"
             )
-        worst = max(apart, worst or 1.0)
-    return worst
+        parts = np.array_split(ratio, min(PARTS, max(ratio.size // PART_SIZE, 1)))
+        apart = max(abs(math.log(np.median(part) / stated)) for part in parts)
+        found.append(Agreement(apart, apart / math.log(stated)))
+    return Agreement(*map(max, zip(*found, strict=True))) if found else None

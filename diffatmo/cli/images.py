@@ -108,6 +108,8 @@ def open_image(spec: ImageSpec, *, may_be_photo: bool) -> Opened:
     merged = bracket.merge(spec.files, [view.image for view in views], spec.options, known)
     options["saturation"] = merged.image.saturation
     encoded = any(view.encoded for view in views)
+    if encoded and merged.tone_error is not None:
+        options.setdefault("tone_error", merged.tone_error)
     return Opened(replace(spec, options=options), merged.image, shot, encoded, (merged.told,))
 
 
