@@ -35,8 +35,6 @@ LOWEST, HIGHEST = 0.05, 0.9
 PARTS, PART_SIZE = 8, 100
 """From dark to bright they are compared in so many parts at most, of so many pixels at least."""
 
-LEAST_TONE_ERROR = 0.01
-
 
 class Agreement(NamedTuple):
     """How well two exposures agree on the light, where they do worst: medians over pixels that are about as bright."""
@@ -54,8 +52,8 @@ class Merged(NamedTuple):
     """Light per unit of exposure, with its noise; a pixel that is clipped in all files is at ``image.saturation``."""
     told: str
     """What was merged, in words."""
-    tone_error: float | None
-    """How well the exposures together know the transfer function that was undone (``tone_error``); None if they say nothing."""
+    exponent_error: float | None
+    """What the exponent of the transfer function that was undone may be off by; None if the exposures do not tell."""
 
 
 def merge(
@@ -105,8 +103,7 @@ def merge(
     )
     span = f"{min(exposures):g} to {max(exposures):g} s"
     agreement = f"; where two show the same, they agree to {100 * found.apart:.1f} %" if found else ""
-    tone_error = min(max(found.exponent, LEAST_TONE_ERROR), 1.0) if found else None
-    return Merged(image, f"merged from {len(files)} files, exposed {span}{agreement}", tone_error)
+    return Merged(image, f"merged from {len(files)} files, exposed {span}{agreement}", found and found.exponent)
 
 
 def _check_same(first: Path, image: "Image", file: Path, other: "Image") -> None:

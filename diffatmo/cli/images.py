@@ -63,6 +63,9 @@ ANGLES = (
 )
 """What :func:`fitting.observe` takes as it is, and what it takes in radians."""
 
+EXPONENT_ERROR = 0.03
+"""Of a transfer function that a bracket confirms: over a factor of 5 in light that is the 5 % which a photo is off by anyway."""
+
 COLOUR_KEYS = ("camera_matrix", "sensitivities")
 """What is said of channels that are bands."""
 
@@ -107,10 +110,11 @@ def open_image(spec: ImageSpec, *, may_be_photo: bool) -> Opened:
     shot, known = _common_shot(spec.files, [view.shot for view in views])
     merged = bracket.merge(spec.files, [view.image for view in views], spec.options, known)
     options["saturation"] = merged.image.saturation
-    encoded = any(view.encoded for view in views)
-    if encoded and merged.tone_error is not None:
-        options.setdefault("tone_error", merged.tone_error)
-    return Opened(replace(spec, options=options), merged.image, shot, encoded, (merged.told,))
+    encoded, told = any(view.encoded for view in views), [merged.told]
+    if encoded and merged.exponent_error is not None and merged.exponent_error < EXPONENT_ERROR:
+        encoded = False
+        told.append("transfer function: that of sRGB, by which the exposures agree")
+    return Opened(replace(spec, options=options), merged.image, shot, encoded, tuple(told))
 
 
 class _View(NamedTuple):
