@@ -218,7 +218,9 @@ def check_bracket(images: Sequence[Path], *, each: bool) -> None:
     if each:
         raise InputError("--bracket and --each contradict each other: one makes one picture of the IMAGEs")
     if len(images) < 2:
-        raise InputError(f"--bracket: got {len(images)} IMAGE, expected at least two exposures of one view")
+        raise InputError(
+            f"--bracket: got {len(images)} IMAGE, expected at least two exposures of one view; a scene file has a list as file"
+        )
     for image in images:
         if image.is_dir():
             raise InputError(f"--bracket: {image} is a folder, expected the files of one view by name")

@@ -64,7 +64,7 @@ ANGLES = (
 """What :func:`fitting.observe` takes as it is, and what it takes in radians."""
 
 EXPONENT_ERROR = 0.03
-"""Of a transfer function that a bracket confirms: over a factor of 5 in light that is the 5 % which a photo is off by anyway."""
+"""Of a transfer function that a bracket confirms: over a factor of 5 that is the 5 % by which a photo is off anyway."""
 
 COLOUR_KEYS = ("camera_matrix", "sensitivities")
 """What is said of channels that are bands."""
