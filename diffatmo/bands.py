@@ -9,7 +9,10 @@ and what the channel c sees is
 with the sensitivity S_c and the spline B_j that is 1 at node j and 0 at the others. The matrix R is the *response*.
 """
 
+import csv
+import io
 from collections.abc import Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -28,6 +31,30 @@ sun from 30° to 93° from the zenith, clear or hazy; most of it is the structur
 
 STEP = 5.0
 """Of integrals over the spectrum, nm."""
+
+
+COLOURS = ("red", "green", "blue")
+
+COLUMNS = ("wavelength_nm", *COLOURS)
+"""Of a table of sensitivities."""
+
+VISIBLE = (400.0, 700.0)
+"""What a table of sensitivities has to cover, nm; most that are published end there."""
+
+WIDEST_STEP = 20.0
+"""Between two rows of such a table, nm, beyond which straight lines are no sensitivities."""
+
+DEEPEST = 0.5
+"""Of a channel's largest sensitivity: how negative it may be. Those of sRGB, which a matrix has drawn apart, go to 0.37."""
+
+
+class Curves(NamedTuple):
+    """Sensitivities of the channels red, green and blue."""
+
+    values: Float[np.ndarray, "n 3"]
+    """Per unit of radiance, in any unit."""
+    wavelengths: Float[np.ndarray, " n"]
+    """nm; they rise."""
 
 
 class Bands(NamedTuple):
@@ -93,10 +120,77 @@ def integrated(
     return Bands(tuple(names), centres, weights @ interpolation(nodes, fine), tuple(map(float, nodes)))
 
 
+def read(path: str | Path) -> Curves:
+    """Sensitivities from a table (CSV) with the columns :data:`COLUMNS` in any order; others are ignored.
+
+    Raises :class:`ValueError` naming the file, if it cannot be read, is no such table, does not cover :data:`VISIBLE` closely,
+    or is negative beyond what a matrix makes of a camera's.
+    """
+    try:
+        return _checked(Path(path).read_bytes())
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read: {error.strerror}") from None
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+
+
+def _checked(data: bytes) -> Curves:
+    try:
+        rows = list(csv.reader(io.StringIO(data.decode("utf-8-sig"))))
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise ValueError(f"not a CSV file: {error}") from None
+    rows = [row for row in rows if row and not row[0].startswith("#")]
+    names = [name.strip() for name in rows[0]] if rows else []
+    if any(names.count(name) != 1 for name in COLUMNS):
+        raise ValueError(f"columns {', '.join(names)}, expected {', '.join(COLUMNS)}, each once")
+    try:
+        table = np.array([[float(row[names.index(name)]) for name in COLUMNS] for row in rows[1:]]).reshape(-1, 4)
+    except (ValueError, IndexError):
+        raise ValueError(f"expected a number for each of {', '.join(COLUMNS)} in every row") from None
+    at, values = table[:, 0], table[:, 1:]
+    if not np.all(np.isfinite(table)):
+        raise ValueError("expected finite numbers")
+    if np.any(np.diff(at) <= 0):
+        raise ValueError("wavelength_nm: expected numbers that rise from row to row")
+    lower, upper = VISIBLE
+    if at.size < 2 or at[0] > lower or at[-1] < upper:
+        covered = f"covers {at[0]:g} to {at[-1]:g} nm" if at.size else "has no rows"
+        raise ValueError(f"{covered}, expected {lower:g} to {upper:g} nm at least")
+    if np.diff(at).max() > WIDEST_STEP:
+        raise ValueError(f"rows are up to {np.diff(at).max():g} nm apart, expected {WIDEST_STEP:g} nm at most")
+    for name, curve in zip(COLOURS, values.T, strict=True):
+        if curve.max() <= 0:
+            raise ValueError(f"{name} sees nothing, expected numbers above 0")
+        if curve.min() < -DEEPEST * curve.max():
+            lowest = f"{curve.min():g} at {at[int(np.argmin(curve))]:g} nm"
+            raise ValueError(
+                f"{name} is {lowest}, expected numbers from 0, or from {-DEEPEST:g} times its largest after a matrix"
+            )
+    return Curves(values, at)
+
+
+def node_error(curves: Curves, nodes: Sequence[float] = NODES) -> float:
+    """Relative error (RMS) of the channels for being asked for at ``nodes`` instead of every :data:`STEP`.
+
+    Of light that air has scattered once and ozone absorbed, along paths of 1 to 10 air masses of both: the structure of ozone's
+    absorption is most of it.
+    """
+    lower, upper = spectrum.WAVELENGTH_RANGE
+    fine = np.arange(lower, upper + STEP / 2, STEP)
+
+    def seen(at: Sequence[float] | np.ndarray) -> np.ndarray:
+        picture = integrated(curves.values, curves.wavelengths, names=COLOURS, nodes=tuple(at))
+        air = 8.0 * np.asarray(spectrum.rayleigh_scattering(jnp.asarray(at)), dtype=float)
+        ozone = 15.0 * np.asarray(spectrum.ozone_absorption(jnp.asarray(at)), dtype=float)
+        return np.stack([picture.response @ (air * np.exp(-mass * (air + ozone))) for mass in (1.0, 2.0, 5.0, 10.0)])
+
+    return float(np.sqrt(np.mean((seen(nodes) / seen(fine) - 1) ** 2)))
+
+
 def srgb(nodes: Sequence[float] = NODES) -> Bands:
     """Linear sRGB by the CIE 1931 2° observer, each channel divided by what it is for the sun: red, green, blue."""
     at, matching = color.observer()
-    return integrated(matching @ color.XYZ_TO_SRGB.T, at, names=("red", "green", "blue"), nodes=nodes)
+    return integrated(matching @ color.XYZ_TO_SRGB.T, at, names=COLOURS, nodes=nodes)
 
 
 def narrow(

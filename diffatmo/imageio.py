@@ -76,6 +76,10 @@ class Image(NamedTuple):
     """As-shot multipliers of a RAW; its pixels are without."""
     saturation: float | None = None
     """What a channel that is clipped has; None if unknown."""
+    noise: Float[np.ndarray, "height width channels"] | None = None
+    """Relative standard deviation of every value, where it is known: of merged exposures."""
+    turned: int = 1
+    """Exif's orientation of the stored picture, which ``pixels`` are turned by."""
 
 
 def read_image(path: str | Path, *, transfer: str | None = None) -> Image:
@@ -147,16 +151,16 @@ def _linear(codes: np.ndarray, transfer: str | None, said: str | None, notes: Ex
         raise _Encoded(f"the file says that it is encoded with {said}, not linear; {state}")
     if transfer is None and codes.dtype == np.uint8 and said is None:
         raise _Encoded(f"8 bits a channel, which is as a rule not linear; {state}")
-    codes = exif.upright(codes, notes.orientation)
+    codes, turned = exif.upright(codes, notes.orientation), notes.orientation or 1
     notes = notes._replace(orientation=notes.orientation and 1, size=codes.shape[:2])
     if codes.dtype.kind == "f":
-        return Image(_light(codes.astype(np.float32), transfer), {}, None, notes)
+        return Image(_light(codes.astype(np.float32), transfer), {}, None, notes, turned=turned)
     white = np.iinfo(codes.dtype).max
     table = _light(np.arange(white + 1, dtype=np.float32) / np.float32(white), transfer)
     values = np.empty(codes.shape, np.float32)
     for row, light in zip(codes, values, strict=True):
         light[:] = table[row]
-    return Image(values, {}, None, notes, saturation=1.0)
+    return Image(values, {}, None, notes, saturation=1.0, turned=turned)
 
 
 def _light(values: np.ndarray, transfer: str | None) -> np.ndarray:
@@ -348,13 +352,16 @@ def _read_heif(path: Path, transfer: str | None) -> Image:
         width = file.size[0]
     codes = codes[:, :width, : 3 if codes.shape[-1] > 2 else 1]
     # HEIF turns its pictures itself; the orientation in the Exif block is a copy of that, and not to be followed again.
-    return _linear(codes, transfer, None, exif.parse(block)._replace(orientation=1))
+    notes = exif.parse(block)
+    return _linear(codes, transfer, None, notes._replace(orientation=1))._replace(turned=notes.orientation or 1)
 
 
 def _read_raw(path: Path, transfer: str | None) -> Image:
     _refuse_transfer(transfer)
     picture = raw.read(path, MAX_PIXELS)
-    return Image(picture.pixels, {}, None, picture.exif, picture.to_xyz, picture.white_balance, 1.0)
+    return Image(
+        picture.pixels, {}, None, picture.exif, picture.to_xyz, picture.white_balance, 1.0, turned=picture.turned
+    )
 
 
 _Reader = Callable[[Path, str | None], Image]

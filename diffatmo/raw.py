@@ -28,6 +28,8 @@ class Raw(NamedTuple):
     white_balance: tuple[float, float, float] | None
     """What the camera would have multiplied red, green and blue by; green is 1."""
     exif: Exif
+    turned: int
+    """Exif's orientation of the stored picture, which ``pixels`` are turned by."""
 
 
 _DAMAGED = "the RAW is damaged"
@@ -74,7 +76,7 @@ def read(path: Path, max_pixels: int) -> Raw:
         pixels = _bayer(file) if _is_bayer(file, rawpy) else _other_sensor(file, rawpy)
     orientation = _ORIENTATIONS.get(sizes.flip, 1)
     pixels = np.ascontiguousarray(exif.upright(pixels, orientation))
-    return Raw(pixels, to_xyz, white_balance, notes._replace(orientation=1, size=pixels.shape[:2]))
+    return Raw(pixels, to_xyz, white_balance, notes._replace(orientation=1, size=pixels.shape[:2]), orientation)
 
 
 def _rawpy() -> ModuleType:

@@ -89,6 +89,8 @@ class Observation(eqx.Module):
     camera: Camera
     bands: Bands | None
     """What its channels see of the spectrum; None if each is one of the atmosphere's wavelengths."""
+    merged: int = eqx.field(static=True, default=1)
+    """Pictures that it was made from."""
 
 
 def observe(
@@ -128,6 +130,7 @@ def observe(
     exposure_value: float = 1.0,
     max_pixels: int = MAX_PIXELS,
     bands: Bands | None = None,
+    merged: int = 1,
     name: str = "image",
 ) -> Observation:
     """Prepare one image for fitting; raises :class:`FitError` for anything that cannot be right.
@@ -188,6 +191,7 @@ def observe(
             directions in each block.
         bands: What the channels see of the spectrum; its nodes must be the wavelengths of the atmosphere, whose sun must have
             the irradiance 1. None if every channel is one of the wavelengths.
+        merged: How many exposures the picture was merged from (:mod:`diffatmo.brackets`), for the report.
         name: Of the image, in messages, tables and file names.
     """
     refuse = _Refusal(name)
@@ -336,6 +340,7 @@ def observe(
         block=block,
         camera=camera,
         bands=bands,
+        merged=merged,
         white=max(white, 1e-30),
         **(fields | {"spread": single} if block == 1 else _bin(fields, block, raised=pedestal != FIXED)),
     )

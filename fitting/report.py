@@ -34,9 +34,10 @@
                       the range ends), ``interval_68`` and ``interval_95`` (null: open on that side), ``differs`` (from that
                       of the standard error)
 ``minima``            ``chi2`` and ``values`` of each, the best first, if the search found several
-``images``            for each: place, sun as given, which nuisances are free, masked pixels by reason, pixels that a robust
-                      loss takes for outliers, and ``residuals``: per wavelength the median and the root mean square of
-                      measured / fitted - 1, and the root mean square in sigmas
+``images``            for each: place, sun as given, which nuisances are free, how many exposures it was merged
+                      from, masked pixels by reason, pixels that a robust loss takes for outliers, and ``residuals``: per
+                      wavelength the median and the root mean square of measured / fitted - 1, and the root mean square in
+                      sigmas
 ``timings``           seconds: ``compile_s``, ``solve_s``, ``total_s``
 ====================  ================================================================================================
 """
@@ -277,6 +278,7 @@ def _image_record(result: Findings, number: int) -> dict[str, Any]:
         "sun_azimuth_deg": azimuth,
         **{kind: getattr(observation, kind) for kind in KINDS},
         "exposure_value": observation.exposure_value,
+        "merged_from": observation.merged,
         "pixels_used": len(relative),
         "pixels_masked": observation.masked,
         "pixels_outlying": result.outliers[number] if result.outliers else 0,
@@ -363,12 +365,13 @@ def _caption(observation: Observation, about: dict[str, Any]) -> str:
     masked = ", ".join(f"{count} {reason}" for reason, count in observation.masked.items())
     median = ", ".join(f"{100 * value:.2g}" for value in about["residuals"]["median_absolute_relative"])
     of_sigma = ", ".join(f"{value:.2g}" for value in about["residuals"]["rms_sigma"])
+    merged = f"merged from {observation.merged} files; " if observation.merged > 1 else ""
     binned = f" (blocks of {observation.block} × {observation.block})" if observation.block > 1 else ""
     choices = {kind.replace("_", " "): getattr(observation, kind) for kind in KINDS}
     free = ", ".join(f"{kind} {choice}" for kind, choice in choices.items() if kind == "exposure" or choice != FIXED)
     outlying = f" ({about['pixels_outlying']} of them outliers)" if about["pixels_outlying"] else ""
     return (
-        f"{observation.name}: sun at zenith angle {about['sun_zenith_deg']:.1f}°, azimuth "
+        f"{observation.name}: {merged}sun at zenith angle {about['sun_zenith_deg']:.1f}°, azimuth "
         f"{about['sun_azimuth_deg']:.1f}°; altitude {observation.altitude:g} km; {free}; "
         f"{about['pixels_used']} pixels used{binned}{outlying}{f', left out: {masked}' if masked else ''}. "
         f"Median |residual| per wavelength: {median} %; residual over stated noise, RMS: {of_sigma}."

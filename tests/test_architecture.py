@@ -70,7 +70,7 @@ LEVELS = [
     ["diffatmo.cli", "diffatmo.cli.cache", "diffatmo.cli.common", "diffatmo.cli.workers"],
     ["diffatmo.cli.keys", "diffatmo.cli.shipped", "diffatmo.cli.results"],
     ["diffatmo.cli.scenefile"],
-    ["diffatmo.cli.photo"],
+    ["diffatmo.cli.photo", "diffatmo.cli.bracket"],
     ["diffatmo.cli.scans"],
     ["diffatmo.cli.images", "diffatmo.cli.origin"],
     ["diffatmo.cli.many"],

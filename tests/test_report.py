@@ -103,6 +103,17 @@ def test_page_needs_nothing_else(written):
         assert text in page
 
 
+def test_what_was_merged_is_said():
+    """Of three exposures; of a single picture nothing is."""
+    plain = toy_sky.result()
+    several = [dataclasses.replace(plain.observations[0], merged=3), *plain.observations[1:]]
+    images = report.record(dataclasses.replace(plain, observations=several))["images"]
+    assert [image["merged_from"] for image in images][:2] == [3, 1]
+    captions = [report._caption(image, about) for image, about in zip(several, images, strict=True)]
+    assert captions[0].startswith(f"{several[0].name}: merged from 3 files; sun at zenith angle")
+    assert captions[1].startswith(f"{several[1].name}: sun at zenith angle")
+
+
 def test_names_are_made_safe():
     found = toy_sky.result()
     names = ["../a b", "a/b", "<b>", "a b"]

@@ -26,6 +26,7 @@ from diffatmo.cli.scenefile import (
     MODELS,
     FitSpec,
     ImageSpec,
+    bracket,
     check_image_options,
     did_you_mean,
     read_scene,
@@ -68,6 +69,12 @@ MAX_STEPS = 100
     "--profile", metavar="NAME,...", help="Numbers whose profile likelihood is wanted: mie_g, mie_optical_depth_550, …"
 )
 @keys.options(IMAGE_KEYS)
+@click.option(
+    "--bracket",
+    "bracketed",
+    is_flag=True,
+    help="The IMAGEs are exposures of one view, to be merged into one picture before it is fitted.",
+)
 @click.option("--each", is_flag=True, help="Fit each image on its own, as those of a FOLDER are.")
 @click.option(
     "--jobs",
@@ -108,6 +115,7 @@ def fit(
     max_steps: int | None,
     starts: int | None,
     profile: str | None,
+    bracketed: bool,
     each: bool,
     processes: int | None,
     hosts: tuple[str, int, int] | None,
@@ -119,7 +127,8 @@ def fit(
     """Recover an atmosphere from images of its sky.
 
     An EXR image written by diffatmo knows its camera and sun; for others, the options say them, for all images alike. A
-    scene file says them for each image. Without images or a scene file, the images that come with diffatmo are fitted.
+    scene file says them for each image. Several images are fitted jointly, with --bracket merged into one, with --each on
+    their own. Without images or a scene file, the images that come with diffatmo are fitted.
 
     Writes fit.json, atmosphere.toml, pictures of images, fits and residuals, and report.html.
 
@@ -139,6 +148,8 @@ def fit(
     if resume and overwrite:
         raise InputError("--resume and --overwrite contradict each other: one keeps what is there, one replaces it")
     options = keys.given(IMAGE_KEYS, values)
+    if bracketed:
+        check_bracket(images, each=each)
     if each or any(image.is_dir() for image in images):
         if not images and not config:
             raise InputError("--each: no IMAGE, FOLDER or --config says what to fit")
@@ -151,7 +162,7 @@ def fit(
     if processes:
         raise InputError("--jobs is for the images of a FOLDER, or with --each")
     first = join(hosts)
-    specs = plan(images, config, options, output)
+    specs = plan(images, config, options, output, bracketed=bracketed)
     # All that can be wrong is found before the first fit, which is written as soon as it is done.
     jobs = {directory: prepare(spec.override(**override)) for directory, spec in specs.items()}
     from fitting import checkpoint, report
@@ -202,7 +213,27 @@ def check_begun(directory: Path, *, resume: bool, overwrite: bool) -> bool:
     return resume and file.exists()
 
 
-def plan(images: Sequence[Path], config: Path | None, options: Mapping[str, Any], output: Path) -> dict[Path, FitSpec]:
+def check_bracket(images: Sequence[Path], *, each: bool) -> None:
+    """Refuse what cannot be the exposures of one view."""
+    if each:
+        raise InputError("--bracket and --each contradict each other: one makes one picture of the IMAGEs")
+    if len(images) < 2:
+        raise InputError(
+            f"--bracket: got {len(images)} IMAGE, expected at least two exposures of one view; a scene file has a list as file"
+        )
+    for image in images:
+        if image.is_dir():
+            raise InputError(f"--bracket: {image} is a folder, expected the files of one view by name")
+
+
+def plan(
+    images: Sequence[Path],
+    config: Path | None,
+    options: Mapping[str, Any],
+    output: Path,
+    *,
+    bracketed: bool = False,
+) -> dict[Path, FitSpec]:
     """What to fit, by the directory its results go to."""
     if images and config:
         raise InputError("IMAGE and --config contradict each other: the scene file names the images")
@@ -211,7 +242,8 @@ def plan(images: Sequence[Path], config: Path | None, options: Mapping[str, Any]
         raise InputError(f"{flag} describes an IMAGE, but none is given" + (f"; say it in {config}" if config else ""))
     if images:
         check_image_options(options, complete=False)
-        return {output: FitSpec(tuple(ImageSpec(image, options) for image in images))}
+        views = [images] if bracketed else [[image] for image in images]
+        return {output: FitSpec(tuple(bracket(files, options) for files in views))}
     if config:
         return {output: read_scene(config)}
     return {output / scene.parent.name: read_scene(scene) for scene in shipped.scenes()}
@@ -274,7 +306,7 @@ def prepare(spec: FitSpec) -> Job:
     from diffatmo.atmosphere import dumps
     from fitting import priors
 
-    if any(scans.is_scan(image.file) for image in spec.images):
+    if any(scans.is_scan(file) for image in spec.images for file in image.files):
         return prepare_scans(spec)
     if spec.init is not None:
         # What is wrong with the fit itself is found before any image is read.
@@ -322,6 +354,8 @@ def prepare_scans(spec: FitSpec) -> Job:
     for image in spec.images:
         if not scans.is_scan(image.file):
             raise InputError(f"{image.file}: an image among scans, expected all to be spectra, or none")
+        if image.others:
+            raise InputError(f"{image.file}: a scan in a bracket, expected pictures")
     if spec.init is not None:
         raise InputError(
             f"init: a scan is fitted from a start of its own, at {len(scans.NODES)} wavelengths; leave it out"

@@ -1,14 +1,24 @@
 """From an image file, and what is said about it, to an observation that can be fitted."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from diffatmo.cli import bracket
 from diffatmo.cli.common import InputError
 from diffatmo.cli.keys import CAMERA_KEYS, flag_of, make_camera, with_sun
-from diffatmo.cli.photo import GLOW_ERROR_DEG, MAX_PIXELS, SUN_SEEN, complete, find_mask, is_photo, shared_noise
+from diffatmo.cli.photo import (
+    GLOW_ERROR_DEG,
+    MAX_PIXELS,
+    SUN_SEEN,
+    channels,
+    complete,
+    find_mask,
+    is_photo,
+    shared_noise,
+)
 from diffatmo.cli.scenefile import LOWEST_SUN_DEG, ImageSpec, check_image_options
 
 if TYPE_CHECKING:
@@ -53,6 +63,12 @@ ANGLES = (
 )
 """What :func:`fitting.observe` takes as it is, and what it takes in radians."""
 
+EXPONENT_ERROR = 0.03
+"""Of a transfer function that a bracket confirms: over a factor of 5 that is the 5 % by which a photo is off anyway."""
+
+COLOUR_KEYS = ("camera_matrix", "sensitivities")
+"""What is said of channels that are bands."""
+
 SAME_WAVELENGTH_NM = 0.01
 
 
@@ -60,10 +76,13 @@ class Opened(NamedTuple):
     """An image as it was read."""
 
     spec: ImageSpec
+    """Of a bracket, what it says of the merged picture."""
     image: "Image"
     shot: "Shot | None"
     encoded: bool
     """Whether it is not linear, and nobody has said by which transfer function; that of sRGB was undone."""
+    told: tuple[str, ...] = ()
+    """What was merged, in words."""
 
     @property
     def photo(self) -> bool:
@@ -79,22 +98,71 @@ class Seen(NamedTuple):
     model: str | None = None
     """That rendered it."""
     assumed: tuple[str, ...] = ()
-    """What was assumed of a photo, in words."""
+    """What was merged, and what was assumed of a photo, in words."""
 
 
 def open_image(spec: ImageSpec, *, may_be_photo: bool) -> Opened:
-    """Read an image and its header."""
+    """Read an image and its header; merge those of a bracket."""
+    views = [_open_file(file, spec.options, may_be_photo=may_be_photo) for file in spec.files]
+    if len(views) == 1:
+        return Opened(spec, *views[0])
+    options = {key: value for key, value in spec.options.items() if key not in bracket.OWN_KEYS}
+    shot, known = _common_shot(spec.files, [view.shot for view in views])
+    merged = bracket.merge(spec.files, [view.image for view in views], spec.options, known)
+    options["saturation"] = merged.image.saturation
+    encoded, told = any(view.encoded for view in views), [merged.told]
+    if encoded and merged.exponent_error is not None and merged.exponent_error < EXPONENT_ERROR:
+        encoded = False
+        told.append("transfer function: that of sRGB, by which the exposures agree")
+    return Opened(replace(spec, options=options), merged.image, shot, encoded, tuple(told))
+
+
+class _View(NamedTuple):
+    """What is in one file."""
+
+    image: "Image"
+    shot: "Shot | None"
+    encoded: bool
+
+
+def _open_file(file: Path, options: Mapping[str, Any], *, may_be_photo: bool) -> _View:
     from diffatmo import imageio, scene
 
-    stated, encoded = spec.options.get("transfer"), False
+    encoded = False
     try:
-        image = imageio.read_image(spec.file, transfer=stated)
+        image = imageio.read_image(file, transfer=options.get("transfer"))
     except imageio.EncodedError:
         if not may_be_photo:
             raise
-        image, encoded = imageio.read_image(spec.file, transfer="srgb"), True
-    shot = scene.from_image(spec.file, image) if scene.ATTRIBUTE in image.metadata else None
-    return Opened(spec, image, shot, encoded)
+        image, encoded = imageio.read_image(file, transfer="srgb"), True
+    shot = scene.from_image(file, image) if scene.ATTRIBUTE in image.metadata else None
+    return _View(image, shot, encoded)
+
+
+def _common_shot(files: Sequence[Path], shots: "Sequence[Shot | None]") -> "tuple[Shot | None, list[float] | None]":
+    """The scene that several exposures have in common, per unit of exposure, and the exposure of each, or neither."""
+    import jax.numpy as jnp
+
+    from diffatmo import scene
+
+    if not any(shots):
+        return None, None
+    alike = [shot and shot._replace(scene=replace(shot.scene, exposure=jnp.ones(()))) for shot in shots]
+    told = [shot and scene.dumps(shot.scene) for shot in alike]
+    for file, text in zip(files, told, strict=True):
+        if text != told[0]:
+            raise InputError(f"{file}: another scene in its header than {files[0]}; expected exposures of one view")
+    return alike[0], [float(shot.scene.exposure) for shot in shots if shot]
+
+
+def _with_known(noise: "np.ndarray | None", chosen: Mapping[str, Any]) -> dict[str, Any]:
+    """What goes to :func:`fitting.observe`, with a ``noise`` of pixels that is known: a relative error comes on top of it."""
+    import numpy as np
+
+    if noise is None:
+        return dict(chosen)
+    others = {key: value for key, value in chosen.items() if key not in NOISE_KEYS}
+    return others | {"noise": np.hypot(noise, chosen.get("noise", 0.0))}
 
 
 def observe_photo(opened: Opened, name: str) -> Seen:
@@ -102,7 +170,7 @@ def observe_photo(opened: Opened, name: str) -> Seen:
     import numpy as np
 
     import fitting
-    from diffatmo import bands, sun
+    from diffatmo import sun
 
     spec = opened.spec
     try:
@@ -110,7 +178,8 @@ def observe_photo(opened: Opened, name: str) -> Seen:
         check_image_options(photo.options)
         options = photo.options
         camera = find_camera(options, photo.pixels, None)
-        assumed = photo.assumed
+        seeing, of_colours = channels(options)
+        assumed = [*opened.told, *of_colours, *photo.assumed]
         towards, seen = _sun_of(photo.pixels, camera, options, stated="sun" in spec.options)
         if not seen:
             options = {"sun_offset": "free", "sun_offset_error_deg": GLOW_ERROR_DEG} | options
@@ -131,10 +200,11 @@ def observe_photo(opened: Opened, name: str) -> Seen:
             altitude=options["altitude_km"],
             sun=np.asarray(towards),
             mask=mask,
-            bands=bands.srgb(),
+            bands=seeing,
             max_pixels=MAX_PIXELS,
             name=name,
-            **stated(options),
+            merged=len(spec.files),
+            **_with_known(photo.noise, stated(options)),
         )
     except ValueError as error:
         raise InputError(f"{spec.file}: {str(error).removeprefix(f'{name}: ')}") from error
@@ -180,11 +250,18 @@ def observe(opened: Opened, name: str, init: "Atmosphere") -> Seen:
     """
     import fitting
 
-    spec, image, shot, _ = opened
+    spec, image, shot = opened.spec, opened.image, opened.shot
     options = spec.options
     try:
         check_image_options(options)
-        pixels = in_order(image, init)
+        for key in COLOUR_KEYS:
+            if key in options:
+                raise InputError(
+                    f"{key}: the channels are wavelengths of the atmosphere, expected a photo without --init"
+                )
+        order = order_of(image, init)
+        pixels = image.pixels[..., order]
+        noise = None if image.noise is None else image.noise[..., order]
         camera, altitude = find_camera(options, pixels, shot), find_altitude(options, shot)
         notes = shot.notes if shot else {}
         chosen = {key: notes[key] for key in NOISE_KEYS if key in notes} | stated(options)
@@ -196,15 +273,16 @@ def observe(opened: Opened, name: str, init: "Atmosphere") -> Seen:
             mask=read_mask(Path(options["mask"])) if "mask" in options else None,
             exposure_value=float(shot.scene.exposure) if shot else 1.0,
             name=name,
-            **chosen,
+            merged=len(spec.files),
+            **_with_known(noise, chosen),
         )
     except ValueError as error:
         raise InputError(f"{spec.file}: {str(error).removeprefix(f'{name}: ')}") from error
-    return Seen(observation, truth_of(shot, init) if shot else None, notes.get("model"))
+    return Seen(observation, truth_of(shot, init) if shot else None, notes.get("model"), opened.told)
 
 
-def in_order(image: "Image", init: "Atmosphere") -> "np.ndarray":
-    """The pixels with their channels in the order of the atmosphere's wavelengths."""
+def order_of(image: "Image", init: "Atmosphere") -> "np.ndarray":
+    """The indices that put the channels of a picture into the order of the atmosphere's wavelengths."""
     import numpy as np
 
     wanted = np.asarray(init.wavelengths, dtype=float)
@@ -222,7 +300,7 @@ def in_order(image: "Image", init: "Atmosphere") -> "np.ndarray":
         order = matching(np.array([3, 2, 1]), wanted)
     else:
         order = np.arange(count)
-    return image.pixels[..., order]
+    return order
 
 
 def matching(own: "np.ndarray", wanted: "np.ndarray") -> "np.ndarray":

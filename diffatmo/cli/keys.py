@@ -76,15 +76,16 @@ class Flag:
 
 @dataclass(frozen=True)
 class Numbers:
-    """A key whose value is a list of numbers, as text with commas between them."""
+    """A key whose value is a list of numbers, as text with commas between them; of ``count`` numbers where that is not None."""
 
     help: str
     expected: str = "numbers, like -0.2, 0.05"
+    count: int | None = None
 
     def read(self, value: Any) -> list[float]:
         """The value, or :class:`ValueError`."""
         items = [float(item) for item in value.split(",")] if isinstance(value, str) else value
-        if not isinstance(items, list):
+        if not isinstance(items, list) or len(items) != (self.count or len(items)):
             raise ValueError
         return [Number("").read(item) for item in items]
 

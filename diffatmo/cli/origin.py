@@ -7,7 +7,7 @@ is, the results are complete, and of what it says. It holds
 ``schema``   ``"diffatmo-origin"``
 ``version``  of diffatmo
 ``file``     the image, as it was named
-``image``    SHA-256 of its contents
+``image``    SHA-256 of its contents; of those of the files of a bracket, one after the other
 ``options``  all that was said about the fit, by key; a file that was named is there with the SHA-256 of its contents
 ===========  ================================================================================================
 """
@@ -37,7 +37,7 @@ def describe(spec: FitSpec) -> dict[str, Any]:
         "schema": SCHEMA,
         "version": __version__,
         "file": printable(image.file),
-        "image": _digest(image.file),
+        "image": _digest(*image.files),
         "options": options,
     }
 
@@ -104,9 +104,12 @@ def _is_file(name: str | Path) -> bool:
         return False
 
 
-def _digest(path: Path) -> str:
-    with open(path, "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+def _digest(*paths: Path) -> str:
+    digest = hashlib.sha256()
+    for path in paths:
+        with open(path, "rb") as file:
+            hashlib.file_digest(file, lambda: digest)
+    return digest.hexdigest()
 
 
 def _shown(value: Any) -> str:

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from diffatmo.atmosphere import Atmosphere
+    from diffatmo.bands import Bands
     from diffatmo.camera import Camera
     from diffatmo.exif import Exif
     from diffatmo.imageio import Image
@@ -64,6 +65,8 @@ class Photo(NamedTuple):
 
     pixels: "np.ndarray"
     """Linear, red, green and blue."""
+    noise: "np.ndarray | None"
+    """Relative standard deviation of each, where it is known; the errors in ``options`` come on top."""
     options: dict[str, Any]
     """As the user could have said them."""
     assumed: list[str]
@@ -106,9 +109,11 @@ def complete(image: "Image", options: Mapping[str, Any], encoded: bool) -> Photo
 
     ``encoded`` is a picture whose transfer function the user has not stated.
     """
-    pixels, said, assumed = _srgb(image), dict(options), list[str]()
+    said, assumed = dict(options), list[str]()
+    image = _srgb(image, _to_xyz(image, options))
     if "mask" not in said:
-        pixels = _shrunk(pixels, image.saturation)
+        image = _shrunk(image)
+    pixels = image.pixels
 
     def take(key: str, value: Any, why: str = "") -> None:
         if key not in said:
@@ -139,39 +144,99 @@ def complete(image: "Image", options: Mapping[str, Any], encoded: bool) -> Photo
     )
     take("sun_exclusion_deg", SUN_DEG)
     take("horizon_exclusion_deg", PANORAMA_HORIZON_DEG if panorama else PHOTO_HORIZON_DEG)
-    return Photo(pixels, said, assumed)
+    return Photo(pixels, image.noise, said, assumed)
 
 
-def _srgb(image: "Image") -> "np.ndarray":
-    """Linear sRGB of any picture; of a RAW through its own matrix."""
+def channels(options: Mapping[str, Any]) -> "tuple[Bands, list[str]]":
+    """What the channels of a photo see of the spectrum, and what is known of the error of that, in words."""
+    from diffatmo import bands
+
+    if "sensitivities" not in options:
+        return bands.srgb(), []
+    file = options["sensitivities"]
+    curves = bands.read(file)
+    try:
+        seen = bands.integrated(curves.values, curves.wavelengths, names=bands.COLOURS)
+    except ValueError as error:
+        raise InputError(f"{file}: {error}") from error
+    off = bands.node_error(curves)
+    return seen, [f"colours: by {file}; the wavelengths of the model show them to {100 * off:.2g} %"]
+
+
+def _to_xyz(image: "Image", options: Mapping[str, Any]) -> "np.ndarray | None":
+    """What takes the colours of the picture to CIE XYZ; None where they are to stay, or are those of sRGB."""
+    import numpy as np
+
+    if "camera_matrix" in options:
+        return np.reshape(options["camera_matrix"], (3, 3))
+    return None if "sensitivities" in options else image.to_xyz
+
+
+def _srgb(image: "Image", to_xyz: "np.ndarray | None") -> "Image":
+    """Linear sRGB, white for daylight (D65), with its noise. A pixel of which a channel is clipped is clipped in all.
+
+    Raises :class:`InputError` for a matrix that is none of a camera.
+    """
     import numpy as np
 
     from diffatmo.color import XYZ_TO_SRGB
 
-    if image.to_xyz is None:
-        return image.pixels
-    matrix = XYZ_TO_SRGB @ np.asarray(image.to_xyz)
-    return (image.pixels @ (matrix / matrix.sum(axis=1, keepdims=True)).T).astype(np.float32)
+    if to_xyz is None:
+        return image
+    if np.linalg.cond(to_xyz) > 1e6:
+        raise InputError("camera_matrix: its rows depend on each other, expected a matrix from RGB to CIE XYZ")
+    daylight = np.linalg.solve(XYZ_TO_SRGB @ to_xyz, np.ones(3))
+    if np.any(daylight <= 0):
+        seen = ", ".join(f"{value:.2g}" for value in daylight)
+        raise InputError(
+            f"camera_matrix: daylight would be {seen} in the picture, expected numbers above 0, by a matrix from RGB to CIE XYZ"
+        )
+    matrix = (XYZ_TO_SRGB @ to_xyz * daylight.max()).astype(np.float32)
+    pixels, noise, saturation = image.pixels @ matrix.T, image.noise, image.saturation
+    if noise is not None:
+        # Errors of the channels are independent, and their variances add.
+        noise = _relative(np.square(noise * image.pixels) @ np.square(matrix).T, pixels)
+    if saturation is not None:
+        clipped = (image.pixels >= SATURATION * saturation).any(axis=-1, keepdims=True)
+        # As much as a channel can have.
+        saturation *= float(np.maximum(matrix, 0).sum(axis=1).max())
+        pixels = np.where(clipped, np.float32(saturation), pixels)
+    return image._replace(pixels=pixels, noise=noise, saturation=saturation)
 
 
-def _shrunk(pixels: "np.ndarray", saturation: float | None) -> "np.ndarray":
+def _relative(variance: "np.ndarray", pixels: "np.ndarray") -> "np.ndarray":
+    """Relative standard deviation of ``pixels``; 0 of those that have no light, or are not known."""
+    import numpy as np
+
+    known = np.isfinite(variance) & np.isfinite(pixels) & (pixels > 0)
+    return np.divide(np.sqrt(np.where(known, variance, 0)), pixels, out=np.zeros_like(pixels), where=known)
+
+
+def _shrunk(image: "Image") -> "Image":
     """Averages over squares, few enough to go on quickly; one with a clipped pixel is clipped, and a panorama stays one."""
     import numpy as np
 
+    pixels, saturation = image.pixels, image.saturation
     height, width = pixels.shape[:2]
     block = max(1, max(height, width) // LONGEST_SIDE)
     while (height % block or width % block) and width in (2 * height, 4 * height):
         block -= 1
     if block == 1:
-        return pixels
+        return image
     rows, columns = height // block, width // block
-    squares = pixels[: rows * block, : columns * block].reshape(rows, block, columns, block, 3)
-    mean = squares.mean(axis=(1, 3), dtype=np.float64).astype(np.float32)
-    if saturation is None:
-        return mean
-    largest = squares.max(axis=(1, 3))
-    clipped = (largest >= SATURATION * saturation).any(axis=-1, keepdims=True)
-    return np.where(clipped, largest, mean)
+
+    def squares(values: "np.ndarray") -> "np.ndarray":
+        return values[: rows * block, : columns * block].reshape(rows, block, columns, block, 3)
+
+    mean = squares(pixels).mean(axis=(1, 3), dtype=np.float64).astype(np.float32)
+    noise = image.noise
+    if noise is not None:
+        noise = _relative(squares(np.square(noise * pixels)).sum(axis=(1, 3)) / block**4, mean)
+    if saturation is not None:
+        largest = squares(pixels).max(axis=(1, 3))
+        clipped = (largest >= SATURATION * saturation).any(axis=-1, keepdims=True)
+        mean = np.where(clipped, largest, mean)
+    return image._replace(pixels=mean, noise=noise)
 
 
 def _take_projection(take: Any, said: dict[str, Any], exif: "Exif", height: int, width: int) -> None:

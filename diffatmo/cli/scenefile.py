@@ -2,13 +2,23 @@
 
 import difflib
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from diffatmo.cli.common import InputError
-from diffatmo.cli.keys import CAMERA_KEYS, PLACE_KEYS, Key, Number, Word, check_camera_options, check_sun_options, read
+from diffatmo.cli.keys import (
+    CAMERA_KEYS,
+    PLACE_KEYS,
+    Key,
+    Number,
+    Numbers,
+    Word,
+    check_camera_options,
+    check_sun_options,
+    read,
+)
 
 FREE = (
     "rayleigh_scattering",
@@ -73,6 +83,18 @@ IMAGE_KEYS: dict[str, Key] = {
     "horizon_exclusion_deg": Number("Leave out pixels nearer to the horizon.  [default: 0]", 0, 89),
     "mask": Word("A picture that is black where pixels are to be left out."),
     "transfer": Word("Transfer function of an 8-bit picture.", ("srgb", "linear")),
+    "exposure_s": Numbers(
+        "Of a bracket: how long each file was exposed, in s.  [default: from Exif, with ISO and f-number]",
+        "numbers above 0, one for each file, like 0.001, 0.008",
+    ),
+    "camera_matrix": Numbers(
+        "Of a photo: what takes its red, green, blue to CIE XYZ, row by row.  [default: RAW: its own; else that of sRGB]",
+        "nine numbers, row by row, like 0.41, 0.36, 0.18, 0.21, 0.72, 0.07, 0.02, 0.12, 0.95",
+        9,
+    ),
+    "sensitivities": Word(
+        "Of a photo, instead: a table (CSV) of what its channels see, wavelength_nm, red, green, blue."
+    ),
 }
 """The keys of an ``[[image]]``, each also an option of the command line."""
 
@@ -111,6 +133,13 @@ class ImageSpec:
 
     file: Path
     options: Mapping[str, Any] = field(default_factory=dict)
+    others: tuple[Path, ...] = ()
+    """Of a bracket: the files of the other exposures."""
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """All of its files."""
+        return (self.file, *self.others)
 
 
 @dataclass(frozen=True)
@@ -138,6 +167,21 @@ def check_image_options(options: Mapping[str, Any], *, complete: bool = True) ->
     """Refuse options of one image that contradict each other; ``complete`` ones have nothing added by what is in the file."""
     check_sun_options(options, complete=complete)
     check_camera_options(options)
+    if "camera_matrix" in options and "sensitivities" in options:
+        raise InputError("sensitivities contradicts camera_matrix: give one or the other")
+
+
+def bracket(files: Sequence[Path], options: Mapping[str, Any]) -> ImageSpec:
+    """One image of several files, or of one; refuses exposures that are not theirs."""
+    exposures = options.get("exposure_s")
+    if exposures is not None and len(files) < 2:
+        raise InputError(
+            'exposure_s: of one file, expected a bracket: several files with --bracket, or file = ["a.jpg", "b.jpg"] in a '
+            "scene file"
+        )
+    if exposures is not None and len(exposures) != len(files):
+        raise InputError(f"exposure_s: got {len(exposures)} numbers for {len(files)} files, expected one for each")
+    return ImageSpec(files[0], options, tuple(files[1:]))
 
 
 def read_scene(path: Path, *, least: int = 1) -> FitSpec:
@@ -187,13 +231,16 @@ def _scene(data: Mapping[str, Any], directory: Path, least: int) -> FitSpec:
 def _image(table: Mapping[str, Any], directory: Path) -> ImageSpec:
     _refuse_unknown(table, ("file", *IMAGE_KEYS))
     file = table.get("file")
-    if not isinstance(file, str) or not file:
-        raise InputError("file: missing, expected the name of an image file")
+    files = file if isinstance(file, list) else [file]
+    names = [name for name in files if isinstance(name, str) and name]
+    if names != files or len(names) < (2 if isinstance(file, list) else 1):
+        raise InputError("file: expected the name of an image file, or a list of those of several exposures")
     options = {key: read(IMAGE_KEYS[key], key, value) for key, value in table.items() if key != "file"}
-    if "mask" in options:
-        options["mask"] = str(directory / options["mask"])
+    for key in ("mask", "sensitivities"):
+        if key in options:
+            options[key] = str(directory / options[key])
     check_image_options(options, complete=False)
-    return ImageSpec(directory / file, options)
+    return bracket([directory / name for name in names], options)
 
 
 def _count(data: Mapping[str, Any], key: str) -> int | None:
