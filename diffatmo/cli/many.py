@@ -24,7 +24,10 @@ from diffatmo.cli.scenefile import FitSpec
 if TYPE_CHECKING:
     from rich.console import Console
 
-SUFFIXES = (".exr", ".hdr", ".pic", ".png", ".tif", ".tiff", ".jpg", ".jpeg")
+SUFFIXES = (
+    *(".exr", ".hdr", ".pic", ".png", ".tif", ".tiff", ".jpg", ".jpeg", ".heic", ".heif", ".hif"),
+    *(".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw"),
+)
 """What the images in a folder end in; a file named by itself may end in anything."""
 
 MOST_JOBS = 8
