@@ -109,6 +109,9 @@ def complete(image: "Image", options: Mapping[str, Any], encoded: bool) -> Photo
     pixels, said, assumed = _srgb(image), dict(options), list[str]()
     if "mask" not in said:
         pixels = _shrunk(pixels, image.saturation)
+        if pixels.shape != image.pixels.shape:
+            height, width = pixels.shape[:2]
+            assumed.append(f"reduced to {width} × {height} pixels, in which all that follows is counted")
 
     def take(key: str, value: Any, why: str = "") -> None:
         if key not in said:
