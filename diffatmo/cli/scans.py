@@ -122,6 +122,8 @@ def assumed(spectra: "Spectra") -> list[str]:
     ]
     if spectra.wavelengths[-1] > LONGEST_NM:
         told.append(f"channels beyond {LONGEST_NM:g} nm are left out: water vapour and oxygen absorb there")
+    if not spectra.own_sun:
+        told.append("irradiance of the sun: the standard spectrum")
     if spectra.albedo is None:
         told.append("albedo of the ground: grey")
     return told
