@@ -68,6 +68,20 @@ def to_linear_srgb(radiance: Radiance, *, wavelengths: Spectrum) -> Float[Array,
     return radiance @ (xyz_weights(wavelengths) @ jnp.asarray(XYZ_TO_SRGB.T, dtype=radiance.dtype))
 
 
+@jax.jit
+def to_linear_srgb_of_sunlight(
+    radiance: Radiance, *, wavelengths: Spectrum, irradiance: Spectrum
+) -> Float[Array, "... 3"]:
+    """Linear sRGB of light from a sun of ``irradiance``, which is white where it is the same at all wavelengths.
+
+    Such a sun is no spectrum but what the light is relative to: through CIE XYZ alone, it would be pink.
+    """
+    irradiance = jnp.asarray(irradiance, dtype=radiance.dtype)
+    white = to_linear_srgb(jnp.ones_like(irradiance), wavelengths=wavelengths)
+    relative = jnp.all(irradiance == irradiance[0])
+    return to_linear_srgb(radiance, wavelengths=wavelengths) / jnp.where(relative, white, 1)
+
+
 def luminance(rgb: Float[Array, "... 3"]) -> Float[Array, "..."]:
     """Luminance Y of linear sRGB."""
     return rgb @ jnp.asarray(LUMINANCE, dtype=rgb.dtype)
@@ -107,4 +121,10 @@ def display(
     radiance: Radiance, *, wavelengths: Spectrum, exposure: float | Float[Array, ""] = 1.0
 ) -> Float[Array, "... 3"]:
     """Code values in [0, 1] for a screen."""
-    return srgb_encode(tone_map(to_linear_srgb(radiance, wavelengths=wavelengths), exposure=exposure))
+    return encode(to_linear_srgb(radiance, wavelengths=wavelengths), exposure=exposure)
+
+
+@jax.jit
+def encode(rgb: Float[Array, "... 3"], *, exposure: float | Float[Array, ""] = 1.0) -> Float[Array, "... 3"]:
+    """Code values in [0, 1] for a screen, of linear sRGB."""
+    return srgb_encode(tone_map(rgb, exposure=exposure))

@@ -11,9 +11,10 @@ A file of a scan is NumPy's ``.npz`` with the arrays
 ``sun_azimuth_deg``  (samples), or one
 ===================  ===================  ====================================================
 
-and, if there are, ``valid`` (samples), ``solar_irradiance`` (channels) at the time, or ``solar_irradiance_1au`` and
-``earth_sun_au``, ``grass_albedo`` or ``ground_albedo`` with its wavelengths, ``fov_deg``; or a CSV with a row for each sample:
-columns of the same names as far as they have a number for each sample, and ``radiance_<nm>`` for every channel.
+and, if there are, ``valid`` (samples), ``solar_irradiance`` (channels) at the time, or ``earth_sun_au`` and, instead of a
+standard spectrum of the sun, ``solar_irradiance_1au``; ``grass_albedo`` or ``ground_albedo`` with its wavelengths,
+``fov_deg``; or a CSV with a row for each sample: columns of the same names as far as they have a number for each sample, and
+``radiance_<nm>`` for every channel.
 """
 
 import csv
@@ -135,6 +136,8 @@ class Spectra(NamedTuple):
     sun_azimuth: Float[np.ndarray, " sample"]
     irradiance: Float[np.ndarray, " channel"]
     """Of the sun above the atmosphere at the time, W m^-2 nm^-1."""
+    own_sun: bool
+    """Whether the file says that irradiance, or it is that of the standard spectrum."""
     albedo: Float[np.ndarray, "2 n"] | None
     """Wavelengths of the ground's albedo, nm, and the albedo."""
     fov: float
@@ -244,6 +247,7 @@ def _checked(columns: Mapping[str, np.ndarray]) -> Spectra:
         angles["sun_zenith_deg"][valid],
         angles["sun_azimuth_deg"][valid],
         irradiance[known],
+        any(name in numbers for name in ("solar_irradiance", "solar_irradiance_1au")),
         _albedo(numbers),
         math.radians(fov),
     )
@@ -260,16 +264,16 @@ def _single(numbers: Mapping[str, np.ndarray], name: str, default: float) -> flo
 def _irradiance(
     numbers: Mapping[str, np.ndarray], wavelengths: np.ndarray, known: Bool[np.ndarray, " channel"]
 ) -> Float[np.ndarray, " channel"]:
+    distance = _single(numbers, "earth_sun_au", 1.0)
+    if not 0.5 < distance < 2:
+        raise ScanError(f"earth_sun_au: got {distance:g}, expected about 1")
     if "solar_irradiance" in numbers:
         value = numbers["solar_irradiance"]
     elif "solar_irradiance_1au" in numbers:
-        distance = _single(numbers, "earth_sun_au", 1.0)
-        if not 0.5 < distance < 2:
-            raise ScanError(f"earth_sun_au: got {distance:g}, expected about 1")
         value = numbers["solar_irradiance_1au"] / distance**2
     else:
         value = np.full(wavelengths.shape, np.nan)
-        value[known] = np.asarray(spectrum.solar_irradiance(wavelengths[known]))
+        value[known] = np.asarray(spectrum.solar_irradiance(wavelengths[known])) / distance**2
     if value.shape != wavelengths.shape or not np.all(value[known] > 0) or not np.all(np.isfinite(value[known])):
         raise ScanError("solar_irradiance: expected a positive number for each wavelength")
     return value

@@ -131,6 +131,7 @@ def _scan_figure(observation: Observation, fitted: Image, residual: Image, scale
     spectra.plot(at, expected.mean(axis=0), "--", color="#c2571a", label="fitted")
     spectra.plot(at, np.sqrt(np.mean((expected - measured) ** 2, axis=0)), color="#888", label="RMS residual")
     spectra.set_xlabel("wavelength, nm" if observation.bands is not None else "channel")
+    spectra.set_ylabel("radiance", fontsize=8)
     spectra.set_ylim(bottom=0)
     spectra.legend(fontsize=8, frameon=False)
     return figure
@@ -239,17 +240,19 @@ def histogram_figure(result: Findings) -> Figure:
     figure = Sheet(figsize=(6.2, 3.4), layout="constrained")
     axes = figure.subplots()
     edges = np.linspace(-6, 6, 61)
+    highest = 0.5
     for observation, whitened in zip(result.observations, result.whitened, strict=True):
-        axes.hist(
+        density, _, _ = axes.hist(
             np.clip(whitened[observation.used], -6, 6).ravel(),
             bins=list(edges),
             density=True,
             histtype="step",
             label=observation.name,
         )
+        highest = max(highest, float(np.max(density)))
     axes.plot(edges, np.exp(-(edges**2) / 2) / math.sqrt(2 * math.pi), "k--", linewidth=1, label="normal")
     axes.set_yscale("log")
-    axes.set_ylim(1e-5, 1)
+    axes.set_ylim(1e-5, 2 * highest)
     axes.set_xlabel("(measured - fitted) / sigma")
     axes.legend(fontsize=8, frameon=False)
     return figure

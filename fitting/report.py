@@ -312,7 +312,9 @@ def page(result: Findings) -> str:
     wavelengths = [float(nm) for nm in result.atmosphere.wavelengths]
     scale = residual_scale(result.residuals)
     images = [
-        figure_tag(image_figure(o, fitted, residual, wavelengths, scale), _caption(o, _image_record(result, number)))
+        figure_tag(
+            image_figure(o, fitted, residual, wavelengths, scale), _caption(o, fitted, _image_record(result, number))
+        )
         for number, (o, fitted, residual) in enumerate(
             zip(result.observations, result.fitted, result.residuals, strict=True)
         )
@@ -361,10 +363,32 @@ def figure_tag(figure: Figure, caption: str) -> str:
     return f"<figure><img src='data:image/png;base64,{picture}' alt=''><figcaption>{html.escape(caption)}</figcaption></figure>"
 
 
-def _caption(observation: Observation, about: dict[str, Any]) -> str:
+MANY = 12
+"""Channels beyond which the median of their residuals is told instead of each."""
+
+
+def _residuals_text(observation: Observation, fitted: np.ndarray, about: dict[str, Any]) -> str:
+    """The residuals of an image in words: of each channel, or, of a spectrometer's many, of all of them."""
+    relative, of_sigma = (np.asarray(about["residuals"][key]) for key in ("median_absolute_relative", "rms_sigma"))
+    relative = 100 * relative
+    if relative.size > MANY:
+        used = observation.used
+        off = math.sqrt(np.mean((fitted - observation.image)[used].astype(float) ** 2))
+        return (
+            f"Median |residual| of a channel: {np.median(relative):.2g} %, at most {relative.max():.2g} %; RMS residual "
+            f"{off:.2g} of a mean of {observation.image[used].mean(dtype=float):.2g} in the units of the measurement; over "
+            f"stated noise, RMS: {np.sqrt(np.mean(of_sigma**2)):.2g}."
+        )
+    of = "wavelength" if observation.bands is None else ", ".join(observation.bands.names)
+    return (
+        f"Median |residual| {'per ' if observation.bands is None else ''}{of}: "
+        f"{', '.join(f'{value:.2g}' for value in relative)} %; residual over stated noise, RMS: "
+        f"{', '.join(f'{value:.2g}' for value in of_sigma)}."
+    )
+
+
+def _caption(observation: Observation, fitted: np.ndarray, about: dict[str, Any]) -> str:
     masked = ", ".join(f"{count} {reason}" for reason, count in observation.masked.items())
-    median = ", ".join(f"{100 * value:.2g}" for value in about["residuals"]["median_absolute_relative"])
-    of_sigma = ", ".join(f"{value:.2g}" for value in about["residuals"]["rms_sigma"])
     merged = f"merged from {observation.merged} files; " if observation.merged > 1 else ""
     binned = f" (blocks of {observation.block} × {observation.block})" if observation.block > 1 else ""
     choices = {kind.replace("_", " "): getattr(observation, kind) for kind in KINDS}
@@ -374,5 +398,5 @@ def _caption(observation: Observation, about: dict[str, Any]) -> str:
         f"{observation.name}: {merged}sun at zenith angle {about['sun_zenith_deg']:.1f}°, azimuth "
         f"{about['sun_azimuth_deg']:.1f}°; altitude {observation.altitude:g} km; {free}; "
         f"{about['pixels_used']} pixels used{binned}{outlying}{f', left out: {masked}' if masked else ''}. "
-        f"Median |residual| per wavelength: {median} %; residual over stated noise, RMS: {of_sigma}."
+        f"{_residuals_text(observation, fitted, about)}"
     )

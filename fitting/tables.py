@@ -19,6 +19,7 @@ from diffatmo.atmosphere import Atmosphere
 from fitting._errors import FitError
 from fitting.combinations import combinations
 from fitting.findings import NINETY_FIVE, ONE_SIGMA, Estimate, Findings, Minimum, Profile
+from fitting.priors import Prior
 
 FAR = 3.0
 """Standard errors from the truth beyond which an estimate is marked."""
@@ -142,6 +143,15 @@ def notes(result: Findings) -> list[str]:
     if result.priors:
         known = "; ".join(f"{prior} ({prior.source})" if prior.source else str(prior) for prior in result.priors)
         found.append(f"Known beforehand: {known}. The column 'by images' says how much of each precision is their own.")
+        if far := [
+            f"{prior.name} by {pull:+.1f} of its errors"
+            for prior in result.priors
+            if abs(pull := _pull(result, prior)) > FAR
+        ]:
+            found.append(
+                f"Far from what was known beforehand: {', '.join(far)}. The images contradict it, or show something that the "
+                "model does not have."
+            )
     if sum(result.outliers):
         found.append(f"{sum(result.outliers)} pixels count for less than half, as outliers.")
     # Combinations are products of powers, which offsets and pedestals, of either sign, have no part in.
@@ -155,6 +165,14 @@ def notes(result: Findings) -> list[str]:
     ]:
         found.append(f"Better known together than alone: {'; '.join(said[:6])}.")
     return found
+
+
+def _pull(result: Findings, prior: Prior) -> float:
+    """How far a number is from what was known of it, in units of that error; of a field, at its first wavelength."""
+    found = next((e.value for e in result.estimates if e.name == prior.name or e.field == prior.name), prior.value)
+    if prior.relative:
+        return math.log(found / prior.value) / prior.error if found > 0 else 0.0
+    return (found - prior.value) / prior.error
 
 
 def profile_text(profile: Profile) -> str:

@@ -65,6 +65,19 @@ def test_three_bands_are_shown_as_given_and_one_as_grey():
     np.testing.assert_array_equal(color.to_linear_srgb(jnp.array([5.0]), wavelengths=jnp.array([550.0])), [5, 5, 5])
 
 
+def test_a_sun_that_light_is_relative_to_is_white():
+    """Whatever the wavelengths; a sun of which the spectrum is known has its own colour."""
+    nodes = jnp.array([405.0, 455.0, 520.0, 570.0, 625.0, 720.0])
+    light = jnp.outer(jnp.array([0.5, 2.0]), jnp.ones(6))
+    shown = color.to_linear_srgb_of_sunlight(light, wavelengths=nodes, irradiance=jnp.ones(6))
+    np.testing.assert_allclose(shown, np.outer([0.5, 2.0], np.ones(3)), rtol=1e-6)
+    known = jnp.linspace(1.0, 2.0, 6)
+    np.testing.assert_array_equal(
+        color.to_linear_srgb_of_sunlight(light, wavelengths=nodes, irradiance=known),
+        color.to_linear_srgb(light, wavelengths=nodes),
+    )
+
+
 def test_luminance_weights_are_those_of_the_standard():
     np.testing.assert_allclose(color.LUMINANCE, [0.2126, 0.7152, 0.0722], atol=1e-4)
 

@@ -194,6 +194,14 @@ def test_a_phone_without_an_equivalent_focal_length():
     assert options["focal_error"] == 0.25
 
 
+def test_a_large_picture_is_reduced_and_says_so(monkeypatch):
+    """The horizon of the messages is in a row of the smaller picture."""
+    monkeypatch.setattr(photo, "LONGEST_SIDE", 20)
+    made = photo.complete(image(PANORAMA, NOTHING), {}, False)
+    assert made.pixels.shape == (10, 20, 3)
+    assert made.assumed[0] == "reduced to 20 × 10 pixels, in which all that follows is counted"
+
+
 @pytest.mark.parametrize("shape", [(20, 40), (10, 40)])
 def test_a_panorama_is_known_by_its_shape(shape):
     """A whole sphere, or its upper half; it finds its own sun, and has neither compass nor lens."""

@@ -11,7 +11,8 @@ from rich.console import Console
 
 from diffatmo import atmosphere, color, imageio, scene
 from fitting import FitError, report
-from fitting.tables import format_number
+from fitting.priors import Prior
+from fitting.tables import format_number, notes
 
 
 @pytest.fixture(scope="module")
@@ -109,9 +110,26 @@ def test_what_was_merged_is_said():
     several = [dataclasses.replace(plain.observations[0], merged=3), *plain.observations[1:]]
     images = report.record(dataclasses.replace(plain, observations=several))["images"]
     assert [image["merged_from"] for image in images][:2] == [3, 1]
-    captions = [report._caption(image, about) for image, about in zip(several, images, strict=True)]
+    captions = [report._caption(*of) for of in zip(several, plain.fitted, images, strict=True)]
     assert captions[0].startswith(f"{several[0].name}: merged from 3 files; sun at zenith angle")
     assert captions[1].startswith(f"{several[1].name}: sun at zenith angle")
+
+
+def test_residuals_of_many_channels_are_told_together():
+    found = toy_sky.result()
+    spread = {"median_absolute_relative": np.linspace(0.01, 0.03, 21), "rms_sigma": np.full(21, 0.5)}
+    page = report._residuals_text(found.observations[0], found.fitted[0], {"residuals": spread})
+    assert page.startswith("Median |residual| of a channel: 2 %, at most 3 %; RMS residual ")
+    assert page.endswith("over stated noise, RMS: 0.5.")
+
+
+def test_what_contradicts_a_prior_is_named():
+    found = toy_sky.result()
+    value = found.estimate("mie_g").value
+    near, far = Prior("mie_g", value + 0.2, 0.1), Prior("mie_g", value * np.exp(4 * 0.1), 0.1, relative=True)
+    assert not any("Far from" in note for note in notes(dataclasses.replace(found, priors=[near])))
+    (said,) = [note for note in notes(dataclasses.replace(found, priors=[near, far])) if "Far from" in note]
+    assert "mie_g by -4.0 of its errors" in said
 
 
 def test_names_are_made_safe():

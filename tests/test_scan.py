@@ -104,6 +104,13 @@ def test_what_the_instrument_says_of_the_sun_the_ground_and_itself(tmp_path):
     np.testing.assert_allclose(found.irradiance, one_au / 1.0131**2, rtol=1e-14)
     np.testing.assert_array_equal(found.albedo, [[500, 800], [0.05, 0.3]])
     assert found.fov == pytest.approx(2 * DEG)
+    # So it falls off for the standard spectrum.
+    standard = scan.read(npz(tmp_path / "c.npz", earth_sun_au=1.0131))
+    np.testing.assert_allclose(
+        standard.irradiance, spectrum.solar_irradiance(columns()["wavelength_nm"]) / 1.0131**2, rtol=1e-6
+    )
+    assert found.own_sun
+    assert not standard.own_sun
     # The irradiance at the time is what counts, if both are given, and an albedo without wavelengths is at the channels'.
     both = scan.read(
         npz(tmp_path / "b.npz", solar_irradiance=2 * one_au, solar_irradiance_1au=one_au, ground_albedo=np.full(4, 0.2))

@@ -155,8 +155,14 @@ def _sheet(scene: "Scene", outcomes: "dict[str, Outcome]", truth: str) -> "Figur
     from diffatmo import color, comparison
     from fitting import figures
 
-    wavelengths = scene.atmosphere.wavelengths
-    exposure = color.auto_exposure(color.to_linear_srgb(jnp.asarray(outcomes[truth].picture), wavelengths=wavelengths))
+    wavelengths, irradiance = scene.atmosphere.wavelengths, scene.atmosphere.solar_irradiance
+    developed = {
+        name: color.to_linear_srgb_of_sunlight(
+            jnp.asarray(outcome.picture), wavelengths=wavelengths, irradiance=irradiance
+        )
+        for name, outcome in outcomes.items()
+    }
+    exposure = color.auto_exposure(developed[truth])
     errors = {name: comparison.relative(scene, outcome, outcomes[truth]) for name, outcome in outcomes.items()}
     bands = [0, wavelengths.size // 2, wavelengths.size - 1] if wavelengths.size > 3 else list(range(wavelengths.size))
     # One scale for all: what most pixels of the worst but one model are within.
@@ -167,8 +173,8 @@ def _sheet(scene: "Scene", outcomes: "dict[str, Outcome]", truth: str) -> "Figur
     shape = scene.camera.height / scene.camera.width
     figure = Figure(figsize=(3 * len(outcomes), 3 * shape * rows + 0.4 * rows), layout="constrained")
     axes = figure.subplots(rows, len(outcomes), squeeze=False)
-    for column, (name, outcome) in enumerate(outcomes.items()):
-        shown = color.display(jnp.asarray(outcome.picture), wavelengths=wavelengths, exposure=exposure)
+    for column, (name, rgb) in enumerate(developed.items()):
+        shown = color.encode(rgb, exposure=exposure)
         axes[0, column].imshow(np.asarray(shown), interpolation="nearest")
         figures.bare(axes[0, column], name)
         for row, band in enumerate(bands, start=1):

@@ -46,9 +46,15 @@ MAX_STEPS = 100
 @click.argument("images", metavar="[IMAGE|FOLDER]...", nargs=-1, type=click.Path(path_type=Path))
 @click.option("--config", metavar="SCENE.toml", type=click.Path(path_type=Path), help="Scene file, instead of images.")
 @click.option(
-    "--init", metavar="ATM.toml", help="Where the fit starts: an atmosphere file or a preset.  [default: earth]"
+    "--init",
+    metavar="ATM.toml",
+    help="Where the fit starts: an atmosphere file or a preset.  [default: earth; of photos and scans a start of their own]",
 )
-@click.option("--free", metavar="NAME,...", help=f"Parameters to recover.  [default: {', '.join(FREE)}]")
+@click.option(
+    "--free",
+    metavar="NAME,...",
+    help=f"Parameters to recover.  [default: {', '.join(FREE)}; of photos and scans fewer]",
+)
 @click.option(
     "--tie",
     metavar="NAME=TIE,...",
@@ -129,6 +135,11 @@ def fit(
     An EXR image written by diffatmo knows its camera and sun; for others, the options say them, for all images alike. A
     scene file says them for each image. Several images are fitted jointly, with --bracket merged into one, with --each on
     their own. Without images or a scene file, the images that come with diffatmo are fitted.
+
+    A photo (three channels, without --init) needs the options alone that its file does not answer, and is asked for them:
+    JPEG, HEIF, RAW, TIFF, HDR panoramas. It has defaults of its own, which are printed: other parameters, a start and
+    priors of a clear day, noise of 5 %, 15° around the sun and the lowest 5 or 10° left out, exposure and pose fitted. So
+    has a scan, a .npz or .csv of measured spectra.
 
     Writes fit.json, atmosphere.toml, pictures of images, fits and residuals, and report.html.
 
@@ -241,6 +252,9 @@ def plan(
         flag = keys.flag_of(next(iter(options)))
         raise InputError(f"{flag} describes an IMAGE, but none is given" + (f"; say it in {config}" if config else ""))
     if images:
+        for image in images:
+            if image.suffix.lower() == ".toml":
+                raise InputError(f"{image}: not an image; a scene file goes with --config, an atmosphere with --init")
         check_image_options(options, complete=False)
         views = [images] if bracketed else [[image] for image in images]
         return {output: FitSpec(tuple(bracket(files, options) for files in views))}
@@ -356,6 +370,11 @@ def prepare_scans(spec: FitSpec) -> Job:
             raise InputError(f"{image.file}: an image among scans, expected all to be spectra, or none")
         if image.others:
             raise InputError(f"{image.file}: a scan in a bracket, expected pictures")
+        for key in image.options:
+            if key not in scans.KEYS:
+                raise InputError(
+                    f"{key}: {image.file} is a scan, which says itself where it looks and where the sun is; leave it out"
+                )
     if spec.init is not None:
         raise InputError(
             f"init: a scan is fitted from a start of its own, at {len(scans.NODES)} wavelengths; leave it out"

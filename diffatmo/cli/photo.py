@@ -112,7 +112,10 @@ def complete(image: "Image", options: Mapping[str, Any], encoded: bool) -> Photo
     said, assumed = dict(options), list[str]()
     image = _srgb(image, _to_xyz(image, options))
     if "mask" not in said:
-        image = _shrunk(image)
+        whole, image = image, _shrunk(image)
+        if image.pixels.shape != whole.pixels.shape:
+            height, width = image.pixels.shape[:2]
+            assumed.append(f"reduced to {width} × {height} pixels, in which all that follows is counted")
     pixels = image.pixels
 
     def take(key: str, value: Any, why: str = "") -> None:

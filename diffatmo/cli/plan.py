@@ -165,7 +165,7 @@ def _find(
         count=count,
         sensor=replace(sensor, noise=given.get("noise", sensor.noise)),
         altitude=given.get("altitude_km"),
-        model=fitting_model(job.model),
+        model=fitting_model(job.model, photos=job.photos),
     )
 
 

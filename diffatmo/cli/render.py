@@ -130,7 +130,9 @@ def _write_png(path: Path, pixels: "np.ndarray", scene: "Scene", notes: dict[str
     from diffatmo import color, imageio
 
     del notes
-    wavelengths, radiance = scene.atmosphere.wavelengths, jnp.asarray(pixels)
-    rgb = color.to_linear_srgb(radiance, wavelengths=wavelengths)
-    codes = color.display(radiance, wavelengths=wavelengths, exposure=color.auto_exposure(rgb) if automatic else 1.0)
+    air = scene.atmosphere
+    rgb = color.to_linear_srgb_of_sunlight(
+        jnp.asarray(pixels), wavelengths=air.wavelengths, irradiance=air.solar_irradiance
+    )
+    codes = color.encode(rgb, exposure=color.auto_exposure(rgb) if automatic else 1.0)
     imageio.write_png(path, np.asarray(codes), overwrite=True)

@@ -25,6 +25,13 @@ INDEPENDENT = 6
 """Numbers of a spectrum whose errors are independent: a calibration, or an aerosol that is unlike the model's, is smooth."""
 
 SUN_DEG, POSE_ERROR_DEG, HEADING_ERROR_DEG = 13.0, 1.0, 3.0
+KEYS = (
+    *("altitude_km", "noise", "noise_shot", "noise_floor", "sun_exclusion_deg", "horizon_exclusion_deg"),
+    *("view_zenith_max_deg", "exposure", "pedestal", "pose", "pose_error_deg", "heading_error_deg"),
+    *("sun_offset", "sun_offset_error_deg", "saturation", "aerosol", "aerosol_error", "aerosol_memory_h", "time_h"),
+)
+"""What a user may say of a scan."""
+
 SLIP_DEG = 45.0
 """Angle by which an instrument's azimuth may be off."""
 
@@ -115,6 +122,8 @@ def assumed(spectra: "Spectra") -> list[str]:
     ]
     if spectra.wavelengths[-1] > LONGEST_NM:
         told.append(f"channels beyond {LONGEST_NM:g} nm are left out: water vapour and oxygen absorb there")
+    if not spectra.own_sun:
+        told.append("irradiance of the sun: the standard spectrum")
     if spectra.albedo is None:
         told.append("albedo of the ground: grey")
     return told
