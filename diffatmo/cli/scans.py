@@ -95,8 +95,8 @@ def slip(spectra: "Spectra") -> float:
     if BETTER * min(other) < min(rest):
         turn = math.degrees(far[int(np.argmin(other))])
         raise InputError(
-            f"view_azimuth_deg: the sky is symmetric about the sun if turned by {turn:.0f} degrees; expected azimuths clockwise "
-            f"from north, as sun_azimuth_deg, and at most {SLIP_DEG:g} degrees off"
+            f"view_azimuth_deg: the sky is symmetric about the sun if turned by {turn:.0f} degrees, expected at most "
+            f"{SLIP_DEG:g}; give azimuths clockwise from north, as sun_azimuth_deg"
         )
     return float(near[int(np.argmin(rest))])
 
@@ -126,7 +126,7 @@ def check(spectra: "Spectra", options: Mapping[str, Any]) -> None:
     least = DARKEST if zenith.max() < DAY_DEG else 0.0
     if options.get("exposure", "fixed") == "fixed" and not least <= typical <= BRIGHTEST:
         raise InputError(
-            f"radiance: π times its median is {typical:.2g} of the sun's irradiance, expected from {DARKEST:g} to {BRIGHTEST:g}; "
+            f"radiance: π times its median is {typical:.2g} of the sun's irradiance, expected {DARKEST:g} to {BRIGHTEST:g}; "
             f"give W m^-2 sr^-1 nm^-1, or {flag_of('exposure')} free"
         )
 
