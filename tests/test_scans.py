@@ -39,7 +39,7 @@ WHOLE = sky()
 BAD = {
     "milliwatts": ({"radiance": 1000 * WHOLE["radiance"]}, "radiance: π times its median is "),
     "counts of dark": ({"radiance": 1e-4 * WHOLE["radiance"]}, "expected 0.0005 to 3; give W m^-2 sr^-1 nm^-1, or"),
-    "from south": ({"view_azimuth_deg": WHOLE["view_azimuth_deg"] + 180}, "about the sun if turned by 180 degrees, expected at"),
+    "from south": ({"view_azimuth_deg": WHOLE["view_azimuth_deg"] + 180}, "the sun if turned by 180 degrees, expected"),
     "counter-clockwise": ({"view_azimuth_deg": -WHOLE["view_azimuth_deg"]}, "view_azimuth_deg: the sky is symmetric about"),
     "another sun": ({"sun_azimuth_deg": WHOLE["sun_azimuth_deg"] + 90}, "give azimuths clockwise from north"),
     "midnight": ({"sun_zenith_deg": np.array(120.0)}, "sun_zenith_deg: got 120, expected at most 108"),

@@ -487,6 +487,8 @@ def run(job: Job, directory: Path, *, overwrite: bool, quiet: bool = False, writ
     if not interrupted:
         file.unlink(missing_ok=True)
     console.print(report.table(result, job.truth))
+    for doubt in report.doubts(result):
+        console.print(f"Doubtful: {doubt}", soft_wrap=True)
     if not result.converged:
         console.print(f"{result.message}{'; the same command with --resume goes on' * interrupted}", soft_wrap=True)
     console.print(f"Report: {directory / 'report.html'}", soft_wrap=True)
