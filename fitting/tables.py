@@ -27,6 +27,9 @@ SURPRISING, UNLIKELY = 0.01, 2.0
 """Probability below which what was found contradicts what was known beforehand, and standard errors from which a number is told
 as one that does."""
 
+POOR = 0.1
+"""Relative residuals of a photo, as a standard deviation, beyond those of clear skies."""
+
 FAR = 3.0
 """Standard errors from the truth beyond which an estimate is marked."""
 
@@ -165,10 +168,11 @@ def surprise(result: Findings) -> str | None:
     if not count or total < float(chdtri(count, SURPRISING)):
         return None
     told = "; ".join(text for _, text in sorted(far, reverse=True)[:4])
+    above_all = f", above all {told}" if told else ""
     return (
-        f"This is not what was known beforehand: χ² = {total:.0f} of {count} numbers{f', above all {told}' if told else ''}. "
-        "Either that is wrong, or the images are not of a sky as the model has it, or their colours are not those of light; the "
-        " standard errors do not contain it."
+        f"This is not what was known beforehand: χ² = {total:.0f} of {count} numbers{above_all}. Either that is wrong, or the "
+        "images are not of a sky as the model has it, or their colours are not those of the light; the standard errors do not "
+        "contain it."
     )
 
 
@@ -182,6 +186,14 @@ def doubts(result: Findings) -> list[str]:
             f"The residuals are {result.error_scale:.1f} times as large as the stated noise, and so are the standard "
             "errors. If the noise is right, the model does not describe the images as precisely as it should."
         )
+    for observation, residual in zip(result.observations, result.residuals, strict=True):
+        # Of a photo the stated noise is that of few independent numbers, and hides what is wrong everywhere.
+        typical = 1.48 * float(np.median(np.abs(residual[observation.used]), axis=0).max())
+        if observation.bands is not None and len(observation.bands.names) == 3 and typical > POOR:
+            found.append(
+                f"{observation.name} differs from what was fitted by {100 * typical:.0f} %; clear skies do by some 5 %. It may "
+                "show clouds, or what is no sky, or not be linear; the standard errors do not contain it."
+            )
     return found
 
 

@@ -8,7 +8,7 @@ import pytest
 import toy_sky
 from toy_sky import Toy
 
-from diffatmo import earth
+from diffatmo import bands, earth
 from fitting import FitError, Prior, fit, priors
 from fitting.nuisances import EACH
 from fitting.parameters import select
@@ -180,3 +180,17 @@ def test_offsets_of_an_image_count_too():
     assert doubts(found) == []
     (said,) = doubts(dataclasses.replace(found, priors=[*known, Prior("chroma", 0.0, 0.02, False, EACH)]))
     assert "χ² = 30 of 3 numbers, above all chroma_a_saturation = " in said
+
+
+def test_residuals_beyond_those_of_clear_skies_are_said():
+    """Only of a photo, whose noise is that of few independent numbers: 1 / 0.8 - 1 = 25 %, and 1.48 times that if normal."""
+    result = toy_sky.result()
+    off = lambda factor, seen: dataclasses.replace(
+        result, observations=seen, fitted=[factor * np.asarray(image) for image in result.fitted]
+    )
+    photos = [dataclasses.replace(image, bands=bands.srgb()) for image in result.observations]
+    assert doubts(off(1.0, photos)) == doubts(off(0.8, result.observations)) == []
+    said = doubts(off(0.8, photos))
+    assert [line.split("; clear")[0] for line in said] == [
+        f"sun {zenith} differs from what was fitted by 37 %" for zenith in (30, 60, 80)
+    ]
