@@ -8,7 +8,16 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from diffatmo.cli.common import InputError
 from diffatmo.cli.keys import CAMERA_KEYS, flag_of, make_camera, with_sun
-from diffatmo.cli.photo import GLOW_ERROR_DEG, MAX_PIXELS, SUN_SEEN, complete, find_mask, is_photo, shared_noise
+from diffatmo.cli.photo import (
+    GLOW_ERROR_DEG,
+    MAX_PIXELS,
+    SUN_SEEN,
+    check_colour,
+    complete,
+    find_mask,
+    is_photo,
+    shared_noise,
+)
 from diffatmo.cli.scenefile import LOWEST_SUN_DEG, ImageSpec, check_image_options
 
 if TYPE_CHECKING:
@@ -107,6 +116,7 @@ def observe_photo(opened: Opened, name: str) -> Seen:
     spec = opened.spec
     try:
         photo = complete(opened.image, spec.options, opened.encoded)
+        check_colour(photo.pixels)
         check_image_options(photo.options)
         options = photo.options
         camera = find_camera(options, photo.pixels, None)
