@@ -10,7 +10,7 @@ import photographs
 import pytest
 
 import fitting
-from diffatmo import bands, color, imageio
+from diffatmo import bands, color, imageio, sun
 from diffatmo.camera import Equirectangular, Pinhole
 from diffatmo.cli import photo
 from diffatmo.cli.common import InputError
@@ -217,6 +217,25 @@ def test_a_panorama_that_knows_better_does_not_look_for_the_sun():
     # 2:1 of a camera with a lens is a picture.
     wide = EXIF._replace(size=(20, 40))
     assert photo.complete(image(PANORAMA, wide), {"pitch_deg": 3.0}, False).options["projection"] == "pinhole"
+
+
+def test_the_sun_is_where_the_sky_is_brightest_if_that_is_one_place():
+    """A glow is found, and one at the horizon; a horizon that is bright all around tells nothing, nor do two glows."""
+    camera = Equirectangular(60, 120)
+    directions = np.asarray(camera.directions())
+    spot = lambda towards: np.exp(-np.sum((directions - towards) ** 2, axis=-1))[..., None] * np.ones(3)
+    for zenith in (30.0, 88.0):
+        towards = np.asarray(sun.direction(zenith=zenith * DEG, azimuth=2.0))
+        # Towards the horizon half of the glow is below it.
+        assert photo.glow(spot(towards), camera) @ towards > np.cos(4 * DEG)
+        # One that is clipped far around the sun has its middle there all the same.
+        clipped = np.minimum(spot(towards), np.exp(-((15 * DEG) ** 2)))
+        assert photo.glow(clipped, camera) @ towards > np.cos(9 * DEG)
+    ring = np.exp(-directions[..., 2:]) * np.ones(3)
+    assert photo.glow(ring, camera) is None
+    both = spot(np.array([0.8, 0.0, 0.6])) + spot(np.array([-0.8, 0.0, 0.6]))
+    assert photo.glow(both, camera) is None
+    assert photo.glow(np.ones((60, 120, 3)), camera) is None
 
 
 def test_a_wide_picture_is_no_panorama():

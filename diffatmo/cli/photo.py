@@ -52,9 +52,10 @@ equivalent focal length."""
 FOCAL_ERROR, POSE_ERROR_DEG, HEADING_ERROR_DEG = 0.25, 3.0, 15.0
 SUN_SEEN = "the sun: where it is seen in the picture"
 SATURATION = 0.98
-GLOW_DEG, GLOW_ERROR_DEG, BRIGHTER = 5.0, 10.0, 1.5
-"""Radius of the brightest part of a sky whose sun is not seen as such, how far from its middle the sun may be, and how much
-brighter than the median it has to be."""
+GLOW_DEG, GLOW_ERROR_DEG, BRIGHTER, TOGETHER = 5.0, 10.0, 1.5, 0.9
+"""Radius of the brightest part of a sky whose sun is not seen as such, how far from its middle the sun may be, how much
+brighter than the median it has to be, and the least length of the mean of its directions: that of a ring about the zenith is
+the cosine of its zenith angle, that of a spot or of a twilight's arch above 0.98."""
 SAME_COLOUR = 0.02
 """Standard deviation of the logarithm of red over blue below which a picture has no colours: black and white, or tinted."""
 SEAM, TIMES = 0.1, 8.0
@@ -347,7 +348,10 @@ def pressure(image: "Image | None") -> tuple[float, float]:
 
 
 def glow(pixels: "np.ndarray", camera: "Camera") -> "np.ndarray | None":
-    """The middle of the brightest part of the sky, some degrees across; None of a sky that is as bright everywhere."""
+    """The middle of the brightest part of the sky, some degrees across.
+
+    None of a sky that is as bright everywhere, or is so here and there, or all along the horizon.
+    """
     import numpy as np
 
     directions = np.asarray(camera.directions()).reshape(-1, 3)
@@ -358,13 +362,15 @@ def glow(pixels: "np.ndarray", camera: "Camera") -> "np.ndarray | None":
         return None
     weight = np.asarray(camera.solid_angles()).ravel()[above]
     light, directions = light[above], directions[above]
-    # The brightest pixels that together are a disc of GLOW_DEG.
+    # The brightest pixels that together are a disc of GLOW_DEG, and all that are as bright: of a plateau it is the middle.
     order = np.argsort(-light, kind="stable")
-    chosen = order[np.cumsum(weight[order]) <= 2 * np.pi * (1 - math.cos(math.radians(GLOW_DEG)))]
-    if not chosen.size or light[chosen].min() < BRIGHTER * np.median(light):
+    within = order[np.cumsum(weight[order]) <= 2 * np.pi * (1 - math.cos(math.radians(GLOW_DEG)))]
+    if not within.size or light[within[-1]] < BRIGHTER * np.median(light):
         return None
-    middle = (weight[chosen, None] * directions[chosen]).sum(axis=0)
-    return (middle / np.linalg.norm(middle)).astype(np.float32)
+    chosen = light >= light[within[-1]]
+    middle = (weight[chosen, None] * directions[chosen]).sum(axis=0) / weight[chosen].sum()
+    length = float(np.linalg.norm(middle))
+    return (middle / length).astype(np.float32) if length > TOGETHER else None
 
 
 def find_mask(pixels: "np.ndarray", camera: "Camera", towards: "np.ndarray", options: Mapping[str, Any]) -> "SkyMask":
