@@ -116,12 +116,12 @@ def observe_photo(opened: Opened, name: str) -> Seen:
     spec = opened.spec
     try:
         photo = complete(opened.image, spec.options, opened.encoded)
-        check_colour(photo.pixels)
         check_image_options(photo.options)
         options = photo.options
         camera = find_camera(options, photo.pixels, None)
         assumed = photo.assumed
         towards, seen = _sun_of(photo.pixels, camera, options, stated="sun" in spec.options)
+        check_colour(photo.pixels)
         if not seen:
             options = {"sun_offset": "free", "sun_offset_error_deg": GLOW_ERROR_DEG} | options
             zenith, azimuth = np.degrees(sun.angles(towards))
