@@ -64,7 +64,9 @@ class DensityProfile(eqx.Module):
 
 
 def _array(value: Any) -> Array:
-    return jnp.asarray(value, dtype=jnp.result_type(float))
+    # What is too large for single precision is refused as infinite, without a warning.
+    with np.errstate(over="ignore"):
+        return jnp.asarray(value, dtype=jnp.result_type(float))
 
 
 class Atmosphere(eqx.Module):

@@ -65,6 +65,9 @@ OFFSETS = (
 )
 """Kind and component of all offsets of an image."""
 
+EACH = "each"
+"""Source of what is known of a kind of offset, whatever the image."""
+
 SUN, POSE, FOCAL, SHADING, AEROSOL = slice(0, 2), slice(2, 5), 5, slice(6, 12), 12
 """Their places among the offsets of an image."""
 
@@ -321,7 +324,7 @@ def assumed(observations: Sequence[Observation]) -> list[tuple[str, float, float
             error, in_degrees = error_of(observation, kind, component), component.endswith("_deg")
             factor = not component
             name = "pose_up_deg" if _is_heading(observation, kind, component) else kind + "_deg" * in_degrees
-            found[name, float(factor), math.degrees(error) if in_degrees else error, factor, "each"] = None
+            found[name, float(factor), math.degrees(error) if in_degrees else error, factor, EACH] = None
     return list(found)
 
 

@@ -427,8 +427,8 @@ def _bin(fields: dict[str, np.ndarray], block: int, *, raised: bool) -> dict[str
     # Variances of independent pixels add, those of their mean are divided by the number squared.
     light = np.ones_like(split["image"]) if raised else split["image"]
     signal = 1.0 if raised else np.maximum(mean("image"), 1e-30)
-    squares = np.where(chosen[..., None], np.nan_to_num(split["noise"] * light) ** 2, 0)
-    relative = np.sqrt(squares.sum((2, 3), dtype=np.float64)) / count[..., None] / signal
+    squares = np.where(chosen[..., None], np.nan_to_num(split["noise"] * light), 0).astype(np.float64) ** 2
+    relative = np.sqrt(squares.sum((2, 3))) / count[..., None] / signal
     dark = np.where(chosen[..., None], split["noise_floor"] ** 2, 0).sum((2, 3), dtype=np.float64)
     binned = {
         "image": mean("image"),

@@ -27,6 +27,7 @@
 ``nuisances``         the same for what else the images depend on (:mod:`fitting.nuisances`), by name: factors of exposure,
                       white balance and focal length; pedestals, in units of the image; offsets of sun and camera, in degrees
 ``priors``            ``name``, ``value``, ``error``, ``relative`` (of the logarithm), ``source`` of each
+``doubts``            in words, why numbers may be wrong by more than their errors; empty if nothing says so
 ``undetermined``      names of the numbers that the images do not determine
 ``covariance``        ``names`` and ``matrix`` (of all numbers above), ``correlation`` likewise
 ``profiles``          for each profile likelihood: ``name``, ``unit``, ``value``, ``standard_error``, ``points`` (values of
@@ -77,9 +78,20 @@ from fitting.findings import NINETY_FIVE, ONE_SIGMA, Estimate, Findings, Profile
 from fitting.nuisances import KINDS, group_of
 from fitting.observation import FIXED, PER_CHANNEL, Observation
 from fitting.storage import installed_version
-from fitting.tables import notes, page_table, profile_text, table, verdict
+from fitting.tables import doubts, notes, page_table, profile_text, table, verdict
 
-__all__ = ["STYLE", "check_writable", "figure_tag", "file_names", "page", "record", "scene_of", "table", "write"]
+__all__ = [
+    "STYLE",
+    "check_writable",
+    "doubts",
+    "figure_tag",
+    "file_names",
+    "page",
+    "record",
+    "scene_of",
+    "table",
+    "write",
+]
 
 SCHEMA, SCHEMA_VERSION = "diffatmo-fit", 2
 
@@ -239,6 +251,7 @@ def record(result: Findings) -> dict[str, Any]:
             "parameters": _by_field([e for e in result.parameters if not e.derived]),
             "derived": _by_field([e for e in result.parameters if e.derived]),
             "nuisances": _by_field(result.nuisances),
+            "doubts": doubts(result),
             "undetermined": result.undetermined,
             "priors": [asdict(prior) for prior in result.priors],
             "covariance": {"names": result.covariance_names, "matrix": result.covariance},

@@ -13,13 +13,22 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
+from scipy.special import chdtri
 
 from diffatmo import imageio
 from diffatmo.atmosphere import Atmosphere
 from fitting._errors import FitError
 from fitting.combinations import combinations
 from fitting.findings import NINETY_FIVE, ONE_SIGMA, Estimate, Findings, Minimum, Profile
+from fitting.nuisances import EACH
 from fitting.priors import Prior
+
+SURPRISING, UNLIKELY = 0.01, 2.0
+"""Probability below which what was found contradicts what was known beforehand, and standard errors from which a number is told
+as one that does."""
+
+POOR = 0.1
+"""Relative residuals of a photo, as a standard deviation, beyond those of clear skies."""
 
 FAR = 3.0
 """Standard errors from the truth beyond which an estimate is marked."""
@@ -123,9 +132,74 @@ def verdict(result: Findings) -> str:
     return f"{state} after {result.iterations} iterations, reduced χ² = {result.reduced_chi2:.3f}"
 
 
+def _told_beforehand(result: Findings, prior: Prior) -> list[Estimate]:
+    """The numbers that ``prior`` is about: of a nuisance, those of every image, of whose offsets it says the kind."""
+    if prior.source != EACH:
+        exact = [e for e in result.parameters if e.name == prior.name]
+        return exact or [e for e in result.parameters if e.field == prior.name]
+    heading = any(other.name == "pose_up_deg" for other in result.priors)
+    kind = prior.name.removesuffix("_deg").removesuffix("_up")
+    own = [e for e in result.nuisances if e.name.startswith(f"{kind}_")]
+    if kind == "pose" and heading:
+        return [e for e in own if e.name.endswith("_up_deg") == (prior.name == "pose_up_deg")]
+    return own
+
+
+def surprise(result: Findings) -> str | None:
+    """What is improbable by all that was known beforehand, in words; None if it is not.
+
+    The squares of (number - value) / error of the priors are of χ² with as many degrees of freedom if they are true; what is
+    told here happens in one of a hundred fits. A prior on a field of numbers that are one is one.
+    """
+    total, count, far = 0.0, 0, list[tuple[float, str]]()
+    for prior in result.priors:
+        off: list[float] = []
+        for estimate in _told_beforehand(result, prior):
+            value = estimate.value
+            if prior.relative and value <= 0:
+                continue
+            away = math.log(value / prior.value) if prior.relative else value - prior.value
+            off.append(away / prior.error)
+            if abs(off[-1]) > UNLIKELY:
+                shown = format_number(value, estimate.standard_error)
+                far.append((abs(off[-1]), f"{estimate.name} = {shown} ({prior}; {abs(off[-1]):.1f} standard errors)"))
+        total += sum(x**2 for x in off)
+        count += len({round(x, 3) for x in off})
+    if not count or total < float(chdtri(count, SURPRISING)):
+        return None
+    told = "; ".join(text for _, text in sorted(far, reverse=True)[:4])
+    above_all = f", above all {told}" if told else ""
+    return (
+        f"This is not what was known beforehand: χ² = {total:.0f} of {count} numbers{above_all}. Either that is wrong, or the "
+        "images are not of a sky as the model has it, or their colours are not those of the light; the standard errors do not "
+        "contain it."
+    )
+
+
+def doubts(result: Findings) -> list[str]:
+    """In words, why the numbers may be wrong by more than their errors."""
+    found = []
+    if said := surprise(result):
+        found.append(said)
+    if result.error_scale > 1.05:
+        found.append(
+            f"The residuals are {result.error_scale:.1f} times as large as the stated noise, and so are the standard "
+            "errors. If the noise is right, the model does not describe the images as precisely as it should."
+        )
+    for observation, residual in zip(result.observations, result.residuals, strict=True):
+        # Of a photo the stated noise is that of few independent numbers, and hides what is wrong everywhere.
+        typical = 1.48 * float(np.median(np.abs(residual[observation.used]), axis=0).max())
+        if observation.bands is not None and len(observation.bands.names) == 3 and typical > POOR:
+            found.append(
+                f"{observation.name} differs from what was fitted by {100 * typical:.0f} %; clear skies do by some 5 %. It may "
+                "show clouds, or what is no sky, or not be linear; the standard errors do not contain it."
+            )
+    return found
+
+
 def notes(result: Findings) -> list[str]:
     """In words, what a reader of the table must know."""
-    found = []
+    found = doubts(result)
     if result.undetermined:
         found.append(f"The images do not determine {', '.join(result.undetermined)}.")
     if held := [e.name for e in result.parameters if e.at_bound]:
@@ -135,23 +209,9 @@ def notes(result: Findings) -> list[str]:
         found.append(f"There are {len(result.minima)} minima, of which this is the best. Elsewhere: {others}.")
     if result.profiles:
         found.append(f"By profile likelihood: {'; '.join(profile_text(profile) for profile in result.profiles)}.")
-    if result.error_scale > 1.05:
-        found.append(
-            f"The residuals are {result.error_scale:.1f} times as large as the stated noise, and so are the standard "
-            "errors. If the noise is right, the model does not describe the images as precisely as it should."
-        )
     if result.priors:
         known = "; ".join(f"{prior} ({prior.source})" if prior.source else str(prior) for prior in result.priors)
         found.append(f"Known beforehand: {known}. The column 'by images' says how much of each precision is their own.")
-        if far := [
-            f"{prior.name} by {pull:+.1f} of its errors"
-            for prior in result.priors
-            if abs(pull := _pull(result, prior)) > FAR
-        ]:
-            found.append(
-                f"Far from what was known beforehand: {', '.join(far)}. The images contradict it, or show something that the "
-                "model does not have."
-            )
     if sum(result.outliers):
         found.append(f"{sum(result.outliers)} pixels count for less than half, as outliers.")
     # Combinations are products of powers, which offsets and pedestals, of either sign, have no part in.
@@ -165,14 +225,6 @@ def notes(result: Findings) -> list[str]:
     ]:
         found.append(f"Better known together than alone: {'; '.join(said[:6])}.")
     return found
-
-
-def _pull(result: Findings, prior: Prior) -> float:
-    """How far a number is from what was known of it, in units of that error; of a field, at its first wavelength."""
-    found = next((e.value for e in result.estimates if e.name == prior.name or e.field == prior.name), prior.value)
-    if prior.relative:
-        return math.log(found / prior.value) / prior.error if found > 0 else 0.0
-    return (found - prior.value) / prior.error
 
 
 def profile_text(profile: Profile) -> str:

@@ -63,6 +63,8 @@ def test_toml_round_trip_in_double_precision(x64):
         ("[5.802e-3, 13.558e-3, 33.1e-3]", "0.1", "rayleigh_scattering_per_km"),
         ("[5.802e-3, 13.558e-3, 33.1e-3]", "[]", "rayleigh_scattering_per_km"),
         ("[5.802e-3, ", "[inf, ", "rayleigh_scattering_per_km"),
+        ("[5.802e-3, ", "[1e300, ", "rayleigh_scattering_per_km"),
+        ("rayleigh_scale_height_km = 8.0", "rayleigh_scale_height_km = 1e300", "finite numbers"),
         ("rayleigh_scale_height_km = 8.0", "rayleigh_scale_height_km = 0.0", "rayleigh_scale_height_km"),
         ("[0.3, 0.3, 0.3]", "[0.3, 0.3, 1.1]", "from 0 to 1"),
         ("[0.0, 0.0, 0.0]", "[0.0, -1.0, 0.0]", "ozone_absorption_per_km"),

@@ -142,6 +142,15 @@ def test_a_black_level_is_no_light():
     assert np.all(observe(-np.ones((32, 64, 3)), pedestal="free").noise_floor == np.float32(1e-4))
 
 
+def test_binning_takes_a_sun_that_is_infinite():
+    """As in a half-precision file; it is left out, whatever it is squared."""
+    pixels = np.ones((32, 64, 3), np.float32)
+    pixels[3, 5] = np.inf
+    found = observe(pixels, max_pixels=32 * 64 // 8, noise=0.1, noise_floor=0.0)
+    assert found.masked["not finite"] == 1
+    assert np.isfinite(found.noise[found.used]).all()
+
+
 def test_binning_leaves_masked_pixels_out():
     pixels = np.ones((32, 64, 3))
     pixels[0, 0] = np.nan

@@ -10,7 +10,7 @@ import photographs
 import pytest
 
 import fitting
-from diffatmo import bands, color, imageio
+from diffatmo import bands, color, imageio, sun
 from diffatmo.camera import Equirectangular, Pinhole
 from diffatmo.cli import photo
 from diffatmo.cli.common import InputError
@@ -227,6 +227,60 @@ def test_a_panorama_that_knows_better_does_not_look_for_the_sun():
     assert photo.complete(image(PANORAMA, wide), {"pitch_deg": 3.0}, False).options["projection"] == "pinhole"
 
 
+def test_the_sun_is_where_the_sky_is_brightest_if_that_is_one_place():
+    """A glow is found, and one at the horizon; a horizon that is bright all around tells nothing, nor do two glows."""
+    camera = Equirectangular(60, 120)
+    directions = np.asarray(camera.directions())
+    spot = lambda towards: np.exp(-np.sum((directions - towards) ** 2, axis=-1))[..., None] * np.ones(3)
+    for zenith in (30.0, 88.0):
+        towards = np.asarray(sun.direction(zenith=zenith * DEG, azimuth=2.0))
+        # Towards the horizon half of the glow is below it.
+        assert photo.glow(spot(towards), camera) @ towards > np.cos(4 * DEG)
+        # One that is clipped far around the sun has its middle there all the same.
+        clipped = np.minimum(spot(towards), np.exp(-((15 * DEG) ** 2)))
+        assert photo.glow(clipped, camera) @ towards > np.cos(9 * DEG)
+    ring = np.exp(-directions[..., 2:]) * np.ones(3)
+    assert photo.glow(ring, camera) is None
+    both = spot(np.array([0.8, 0.0, 0.6])) + spot(np.array([-0.8, 0.0, 0.6]))
+    assert photo.glow(both, camera) is None
+    assert photo.glow(np.ones((60, 120, 3)), camera) is None
+
+
+def test_a_wide_picture_is_no_panorama():
+    """Only a full turn comes back to where it began; unless the user says that it is one."""
+    sky = np.exp(np.linspace(0, 1, 40))[None, :, None] * np.full((20, 1, 3), 0.5, np.float32)
+    with pytest.raises(InputError, match=r"^projection: .* its left and right edge differ by 100 %; give --projection"):
+        photo.complete(image(sky, NOTHING), {}, False)
+    assert photo.complete(image(sky, NOTHING), {"projection": "equirectangular"}, False).options["sun"] == "detect"
+    there_and_back = np.concatenate([sky[:, ::2], sky[:, ::-2]], axis=1)
+    assert photo.complete(image(there_and_back, NOTHING), {}, False).options["projection"] == "equirectangular"
+
+
+def test_a_picture_without_colours_is_refused():
+    """Black and white, and tinted; one with colours of its own is not, nor one without light."""
+    grey = seascape().mean(axis=-1, keepdims=True)
+    for tint in ([1, 1, 1], [1.1, 0.9, 0.6]):
+        with pytest.raises(InputError, match="black and white, or of one colour"):
+            photo.check_colour(grey * np.array(tint, np.float32))
+    photo.check_colour(seascape())
+    photo.check_colour(np.zeros((4, 8, 3), np.float32))
+
+
+def test_the_sun_is_said_where_it_is():
+    """Of a clock that is off: by how much the sun was down, and refused if the exposure says that it was up."""
+    made = photo.complete(image(), {}, True)
+    assert any("above the horizon at azimuth" in line for line in made.assumed)
+    night = EXIF._replace(time=TIME.replace(hour=20))
+    assert any("below the horizon at azimuth" in line for line in photo.complete(image(exif=night), {}, True).assumed)
+    day = night._replace(exposure_s=1 / 500, f_number=8.0, iso=100.0)
+    with pytest.raises(
+        InputError, match=r"^time: the sun is .* degrees below the horizon then, but the exposure is one for"
+    ):
+        photo.complete(image(exif=day), {}, True)
+    photo.complete(image(exif=day._replace(exposure_s=4.0, f_number=2.0)), {}, True)
+    photo.complete(image(exif=day), {"time": TIME}, True)
+
+
 def test_photos_are_pictures_of_three_channels_without_wavelengths():
     assert photo.is_photo(image())
     assert not photo.is_photo(image(wavelengths=(680.0, 550.0, 440.0)))
@@ -301,7 +355,7 @@ def test_a_real_photograph(shared):
     # A camera that looks up by 4°, straight ahead at the azimuth of the compass.
     ahead = np.asarray(camera.rotation())[:, 1]
     assert math.degrees(math.atan2(ahead[0], ahead[1])) == pytest.approx(56, abs=1e-3)
-    row = next(float(line.split("row ")[1].split(";")[0]) for line in made.assumed if "horizon" in line)
+    row = next(float(line.split("row ")[1].split(";")[0]) for line in made.assumed if "horizon in row" in line)
     centre = np.asarray(camera.directions_at(np.array((1152 - 1) / 2), np.array(row)))
     assert math.degrees(math.asin(centre[2])) == pytest.approx(0, abs=0.2)
 

@@ -1,14 +1,18 @@
 """Priors: residuals of their own, the share of the images, and the numbers of the named ones."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import toy_sky
 from toy_sky import Toy
 
-from diffatmo import earth
+from diffatmo import bands, earth
 from fitting import FitError, Prior, fit, priors
+from fitting.nuisances import EACH
 from fitting.parameters import select
+from fitting.tables import doubts, notes
 
 FEW = ["rayleigh_scattering", "mie_scattering", "mie_g", "mie_scale_height"]
 
@@ -143,3 +147,50 @@ def test_priors_make_the_undetermined_determined():
     assert known.estimate("exposure_camera").standard_error == pytest.approx(0.01, rel=0.05)
     assert known.estimate("solar_irradiance_680").data_share < 1e-3
     assert known.estimate("mie_g").data_share == pytest.approx(1, abs=1e-3)
+
+
+def test_what_contradicts_what_was_known_is_said():
+    """The χ² of the priors: one in a hundred exceeds 11.3 with three degrees of freedom."""
+    result = toy_sky.result()
+    of = lambda name: result.estimate(name).value
+    near = [
+        Prior("mie_g", of("mie_g") + 0.1, 0.1),
+        Prior("mie_scale_height", 1.01 * of("mie_scale_height"), 0.01, True),
+    ]
+    assert doubts(dataclasses.replace(result, priors=near)) == []
+    assert doubts(dataclasses.replace(result, priors=[])) == []
+    grey = dataclasses.replace(result, priors=[*near, Prior("ground_albedo", of("ground_albedo_550") - 0.03, 0.01)])
+    (said,) = doubts(grey)
+    assert "above all ground_albedo_" in said
+    assert "standard errors)" in said
+    assert notes(grey)[0] == said
+    far = dataclasses.replace(result, priors=[*near, Prior("mie_scale_height", 2 * of("mie_scale_height"), 0.1, True)])
+    (said,) = doubts(far)
+    # ln 2 / 0.1, squared, and 1 for each of the others.
+    assert f"χ² = {(np.log(2) / 0.1) ** 2 + 2:.0f} of 3 numbers, above all mie_scale_height = " in said
+    assert "6.9 standard errors" in said
+
+
+def test_offsets_of_an_image_count_too():
+    """Of the camera as well: the heading has an error of its own."""
+    number = lambda name, value: dataclasses.replace(toy_sky.result().parameters[0], name=name, field=name, value=value)
+    nuisances = [number("pose_a_east_deg", 2.0), number("pose_a_up_deg", 20.0), number("chroma_a_saturation", 0.1)]
+    known = [Prior("pose_deg", 0.0, 2.0, False, EACH), Prior("pose_up_deg", 0.0, 10.0, False, EACH)]
+    found = dataclasses.replace(toy_sky.result(), nuisances=nuisances, priors=known)
+    assert doubts(found) == []
+    (said,) = doubts(dataclasses.replace(found, priors=[*known, Prior("chroma", 0.0, 0.02, False, EACH)]))
+    assert "χ² = 30 of 3 numbers, above all chroma_a_saturation = " in said
+
+
+def test_residuals_beyond_those_of_clear_skies_are_said():
+    """Only of a photo, whose noise is that of few independent numbers: 1 / 0.8 - 1 = 25 %, and 1.48 times that if normal."""
+    result = toy_sky.result()
+    off = lambda factor, seen: dataclasses.replace(
+        result, observations=seen, fitted=[factor * np.asarray(image) for image in result.fitted]
+    )
+    photos = [dataclasses.replace(image, bands=bands.srgb()) for image in result.observations]
+    assert doubts(off(1.0, photos)) == doubts(off(0.8, result.observations)) == []
+    said = doubts(off(0.8, photos))
+    assert [line.split("; clear")[0] for line in said] == [
+        f"sun {zenith} differs from what was fitted by 37 %" for zenith in (30, 60, 80)
+    ]

@@ -11,8 +11,7 @@ from rich.console import Console
 
 from diffatmo import atmosphere, color, imageio, scene
 from fitting import FitError, report
-from fitting.priors import Prior
-from fitting.tables import format_number, notes
+from fitting.tables import format_number
 
 
 @pytest.fixture(scope="module")
@@ -121,15 +120,6 @@ def test_residuals_of_many_channels_are_told_together():
     page = report._residuals_text(found.observations[0], found.fitted[0], {"residuals": spread})
     assert page.startswith("Median |residual| of a channel: 2 %, at most 3 %; RMS residual ")
     assert page.endswith("over stated noise, RMS: 0.5.")
-
-
-def test_what_contradicts_a_prior_is_named():
-    found = toy_sky.result()
-    value = found.estimate("mie_g").value
-    near, far = Prior("mie_g", value + 0.2, 0.1), Prior("mie_g", value * np.exp(4 * 0.1), 0.1, relative=True)
-    assert not any("Far from" in note for note in notes(dataclasses.replace(found, priors=[near])))
-    (said,) = [note for note in notes(dataclasses.replace(found, priors=[near, far])) if "Far from" in note]
-    assert "mie_g by -4.0 of its errors" in said
 
 
 def test_names_are_made_safe():

@@ -380,14 +380,16 @@ def prepare_scans(spec: FitSpec) -> Job:
             f"init: a scan is fitted from a start of its own, at {len(scans.NODES)} wavelengths; leave it out"
         )
     names = image_names(spec.images)
-    try:
-        read = [scan.read(image.file) for image in spec.images]
-        observations = [
-            scans.observe(spectra, image.options, stated(image.options), name)
-            for spectra, image, name in zip(read, spec.images, names, strict=True)
-        ]
-    except ValueError as error:
-        raise InputError(str(error)) from error
+    read, observations = [], []
+    for image, name in zip(spec.images, names, strict=True):
+        try:
+            read.append(scan.read(image.file))
+        except scan.ScanError as error:
+            raise InputError(str(error)) from error
+        try:
+            observations.append(scans.observe(read[-1], image.options, stated(image.options), name))
+        except ValueError as error:
+            raise InputError(f"{image.file}: {str(error).removeprefix(f'{name}: ')}") from error
     chosen = choose(spec, scans.start(read[0]), scans.FREE, scans.TIE, priors.typical)
     return Job(
         observations=observations,
@@ -538,6 +540,8 @@ def run(job: Job, directory: Path, *, overwrite: bool, quiet: bool = False, writ
     if not interrupted:
         file.unlink(missing_ok=True)
     console.print(report.table(result, job.truth))
+    for doubt in report.doubts(result):
+        console.print(f"Doubtful: {doubt}", soft_wrap=True)
     if not result.converged:
         console.print(f"{result.message}{'; the same command with --resume goes on' * interrupted}", soft_wrap=True)
     console.print(f"Report: {directory / 'report.html'}", soft_wrap=True)

@@ -14,6 +14,7 @@ from diffatmo.cli.photo import (
     MAX_PIXELS,
     SUN_SEEN,
     channels,
+    check_colour,
     complete,
     find_mask,
     is_photo,
@@ -181,6 +182,7 @@ def observe_photo(opened: Opened, name: str) -> Seen:
         seeing, of_colours = channels(options)
         assumed = [*opened.told, *of_colours, *photo.assumed]
         towards, seen = _sun_of(photo.pixels, camera, options, stated="sun" in spec.options)
+        check_colour(photo.pixels)
         if not seen:
             options = {"sun_offset": "free", "sun_offset_error_deg": GLOW_ERROR_DEG} | options
             zenith, azimuth = np.degrees(sun.angles(towards))

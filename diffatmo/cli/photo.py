@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from diffatmo.cli.common import InputError
-from diffatmo.cli.keys import flag_of
+from diffatmo.cli.keys import flag_of, with_sun
 
 if TYPE_CHECKING:
     import numpy as np
@@ -53,9 +53,17 @@ equivalent focal length."""
 FOCAL_ERROR, POSE_ERROR_DEG, HEADING_ERROR_DEG = 0.25, 3.0, 15.0
 SUN_SEEN = "the sun: where it is seen in the picture"
 SATURATION = 0.98
-GLOW_DEG, GLOW_ERROR_DEG, BRIGHTER = 5.0, 10.0, 1.5
-"""Radius of the brightest part of a sky whose sun is not seen as such, how far from its middle the sun may be, and how much
-brighter than the median it has to be."""
+GLOW_DEG, GLOW_ERROR_DEG, BRIGHTER, TOGETHER = 5.0, 10.0, 1.5, 0.9
+"""Radius of the brightest part of a sky whose sun is not seen as such, how far from its middle the sun may be, how much
+brighter than the median it has to be, and the least length of the mean of its directions: that of a ring about the zenith is
+the cosine of its zenith angle, that of a spot or of a twilight's arch above 0.98."""
+SAME_COLOUR = 0.02
+"""Standard deviation of the logarithm of red over blue below which a picture has no colours: black and white, or tinted."""
+SEAM, TIMES = 0.1, 8.0
+"""By how much, as a logarithm, the left and the right edge of a panorama may differ, and by how many times as much as two
+columns beside each other."""
+DUSK_DEG, DAYLIGHT_S = 6.0, 1e-3
+"""Below the horizon by so much, the sun leaves too little light for so short an exposure, as seconds at f/1 and ISO 100."""
 SCALE_HEIGHT_KM = 8.4
 """Of pressure, for the air above a place of known altitude."""
 
@@ -125,8 +133,11 @@ def complete(image: "Image", options: Mapping[str, Any], encoded: bool) -> Photo
                 assumed.append(why)
 
     height, width = pixels.shape[:2]
+    stated = "projection" in said
     _take_projection(take, said, image.exif, height, width)
     panorama = said["projection"] == "equirectangular"
+    if panorama and not stated:
+        _check_seam(pixels)
     take("altitude_km", EYE_LEVEL_KM, f"altitude above the ground: {1000 * EYE_LEVEL_KM:g} m")
     _take_sun(take, said, image.exif, panorama)
     if said["projection"] == "pinhole":
@@ -213,6 +224,36 @@ def _relative(variance: "np.ndarray", pixels: "np.ndarray") -> "np.ndarray":
 
     known = np.isfinite(variance) & np.isfinite(pixels) & (pixels > 0)
     return np.divide(np.sqrt(np.where(known, variance, 0)), pixels, out=np.zeros_like(pixels), where=known)
+
+
+def check_colour(pixels: "np.ndarray") -> None:
+    """Refuse a picture of one colour, whose channels tell nothing of a spectrum."""
+    import numpy as np
+
+    lit = np.isfinite(pixels).all(axis=-1) & (pixels > 0).all(axis=-1)
+    ratio = np.log(pixels[lit][:, 0] / pixels[lit][:, 2])
+    if ratio.size and ratio.std() < SAME_COLOUR:
+        raise InputError(
+            "the picture is black and white, or of one colour: red over blue is the same everywhere, expected a colour picture"
+        )
+
+
+def _check_seam(pixels: "np.ndarray") -> None:
+    """Refuse a picture that is taken for a panorama by its shape alone, but whose edges do not meet behind the camera."""
+    import numpy as np
+
+    # The upper quarter, above most buildings, whose edge might be there.
+    light = np.log(np.maximum(pixels[: len(pixels) // 4].mean(axis=-1), 1e-30))
+    light = light[np.isfinite(light).all(axis=1)]
+    if not light.size:
+        return
+    across = float(np.median(np.abs(light[:, 0] - light[:, -1])))
+    beside = float(np.median(np.abs(np.diff(light, axis=1))))
+    if across > max(SEAM, TIMES * beside):
+        raise InputError(
+            f"projection: the picture has the shape of a panorama, but its left and right edge differ by {100 * across:.0f} %; "
+            f"give {flag_of('projection')}, and {flag_of('fov_deg')} unless it is one"
+        )
 
 
 def _shrunk(image: "Image") -> "Image":
@@ -304,10 +345,12 @@ def _take_sun(take: Any, said: dict[str, Any], exif: "Exif", panorama: bool) -> 
         lacks.append("where it was taken")
         options += [flag_of("latitude_deg"), flag_of("longitude_deg")]
     if not lacks:
-        take("time", exif.time, f"the sun: at {exif.time.isoformat()}, as Exif says" if exif.time else "")
         if not placed:
             take("latitude_deg", exif.latitude_deg)
             take("longitude_deg", exif.longitude_deg)
+        time: Any = said.get("time", exif.time)
+        where = _sun_at({**said, "time": time}, exif)
+        take("time", time, f"the sun: at {time.isoformat()}, as Exif says, {where}")
     elif panorama and not from_user:
         take("sun", "detect", SUN_SEEN)
     else:
@@ -315,6 +358,21 @@ def _take_sun(take: Any, said: dict[str, Any], exif: "Exif", panorama: bool) -> 
             f"the sun: the file does not say {' nor '.join(lacks)}; give {' and '.join(options)}, or "
             f"{flag_of('sun_zenith_deg')} and {flag_of('sun_azimuth_deg')}"
         )
+
+
+def _sun_at(said: Mapping[str, Any], exif: "Exif") -> str:
+    """Where the sun is then and there, in words; refuses a night that was exposed like a day."""
+    from diffatmo.brackets import exposure_of
+
+    angles = with_sun({key: said[key] for key in ("time", "latitude_deg", "longitude_deg")})
+    elevation, exposure = 90 - angles["sun_zenith_deg"], exposure_of(exif)
+    if elevation < -DUSK_DEG and exposure is not None and exposure < DAYLIGHT_S:
+        raise InputError(
+            f"time: the sun is {-elevation:.1f} degrees below the horizon then, but the exposure is one for daylight; give "
+            f"{flag_of('time')} with its offset from UTC"
+        )
+    side = "above" if elevation >= 0 else "below"
+    return f"{abs(elevation):.1f}° {side} the horizon at azimuth {angles['sun_azimuth_deg']:.0f}°"
 
 
 def _take_pose(take: Any, said: dict[str, Any], exif: "Exif", pixels: "np.ndarray") -> None:
@@ -358,7 +416,10 @@ def pressure(image: "Image | None") -> tuple[float, float]:
 
 
 def glow(pixels: "np.ndarray", camera: "Camera") -> "np.ndarray | None":
-    """The middle of the brightest part of the sky, some degrees across; None of a sky that is as bright everywhere."""
+    """The middle of the brightest part of the sky, some degrees across.
+
+    None of a sky that is as bright everywhere, or is so here and there, or all along the horizon.
+    """
     import numpy as np
 
     directions = np.asarray(camera.directions()).reshape(-1, 3)
@@ -369,13 +430,15 @@ def glow(pixels: "np.ndarray", camera: "Camera") -> "np.ndarray | None":
         return None
     weight = np.asarray(camera.solid_angles()).ravel()[above]
     light, directions = light[above], directions[above]
-    # The brightest pixels that together are a disc of GLOW_DEG.
+    # The brightest pixels that together are a disc of GLOW_DEG, and all that are as bright: of a plateau it is the middle.
     order = np.argsort(-light, kind="stable")
-    chosen = order[np.cumsum(weight[order]) <= 2 * np.pi * (1 - math.cos(math.radians(GLOW_DEG)))]
-    if not chosen.size or light[chosen].min() < BRIGHTER * np.median(light):
+    within = order[np.cumsum(weight[order]) <= 2 * np.pi * (1 - math.cos(math.radians(GLOW_DEG)))]
+    if not within.size or light[within[-1]] < BRIGHTER * np.median(light):
         return None
-    middle = (weight[chosen, None] * directions[chosen]).sum(axis=0)
-    return (middle / np.linalg.norm(middle)).astype(np.float32)
+    chosen = light >= light[within[-1]]
+    middle = (weight[chosen, None] * directions[chosen]).sum(axis=0) / weight[chosen].sum()
+    length = float(np.linalg.norm(middle))
+    return (middle / length).astype(np.float32) if length > TOGETHER else None
 
 
 def find_mask(pixels: "np.ndarray", camera: "Camera", towards: "np.ndarray", options: Mapping[str, Any]) -> "SkyMask":
