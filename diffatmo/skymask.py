@@ -609,11 +609,26 @@ TINTS = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 0], [0.3, 0.2, 0.1], [0, 0.8, 0.2
 
 def picture(pixels: Float[np.ndarray, "height width 3"], mask: SkyMask) -> Float[np.ndarray, "height width 3"]:
     """Code values in [0, 1] for a screen: clear sky as it is, the rest dimmed and in the colour of its reason."""
+    return painted(developed(pixels, mask.sky), mask.label, TINTS)
+
+
+def developed(
+    pixels: Float[np.ndarray, "height width 3"], sky: Bool[np.ndarray, "height width"]
+) -> Float[np.ndarray, "height width 3"]:
+    """Code values in [0, 1] of linear red, green, blue for a screen, in the exposure of the ``sky``."""
     light = np.maximum(np.nan_to_num(_checked(pixels).astype(np.float64), nan=0.0, posinf=np.inf), 0)
     mean = light.mean(axis=-1)
     shown = np.isfinite(mean) & (mean > 0)
-    chosen = mean[shown & mask.sky] if (shown & mask.sky).any() else mean[shown]
+    chosen = mean[shown & sky] if (shown & sky).any() else mean[shown]
     white = np.percentile(chosen, 90) if chosen.size else 1.0
-    codes = (-np.expm1(-light / white)) ** (1 / 2.2)
-    tinted = 0.5 * codes.mean(axis=-1, keepdims=True) + 0.5 * TINTS[mask.label]
-    return np.where(mask.sky[..., None], codes, tinted).astype(np.float32)
+    return ((-np.expm1(-light / white)) ** (1 / 2.2)).astype(np.float32)
+
+
+def painted(
+    codes: Float[np.ndarray, "height width 3"],
+    label: UInt8[np.ndarray, "height width"],
+    tints: Float[np.ndarray, "n 3"],
+) -> Float[np.ndarray, "height width 3"]:
+    """Code values as they are where the label is 0, elsewhere dimmed and in the tint of the label."""
+    tinted = 0.5 * codes.mean(axis=-1, keepdims=True) + 0.5 * np.asarray(tints)[label]
+    return np.where((label == 0)[..., None], codes, tinted).astype(np.float32)

@@ -2,21 +2,22 @@
 
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from statistics import NormalDist
 from typing import Any
 
 import jax.numpy as jnp
 import matplotlib
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure, FigureBase
+from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
-from diffatmo import color
+from diffatmo import color, skymask
 from fitting.findings import NINETY_FIVE, ONE_SIGMA, Findings, Profile
 from fitting.nuisances import channels
 from fitting.observation import Observation
@@ -31,10 +32,13 @@ class Sheet(Figure):
         return as_png(self)
 
 
+DPI = 110
+
+
 def as_png(figure: Figure) -> bytes:
     """A figure as a PNG file."""
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=110)
+    figure.savefig(buffer, format="png", dpi=DPI)
     return buffer.getvalue()
 
 
@@ -78,11 +82,89 @@ def bare(axes: Axes, title: str) -> None:
     axes.set_yticks([])
 
 
+TINTS = dict(zip(skymask.REASONS, map(tuple, skymask.TINTS.tolist()), strict=True)) | {
+    "below the horizon": (0.15, 0.15, 0.2),
+    "near the sun": (1.0, 0.75, 0.45),
+    "near the horizon": (0.6, 0.25, 0.9),
+    "masked by the user": (1.0, 0.35, 0.65),
+}
+"""Colours of the reasons for which pixels of a photo are left out."""
+_OTHER = (0.6, 0.6, 0.6)
+
+LONG, SHORT = 1024, 600
+"""Pixels of the longer side of a photo in a figure: at most, and what a small one is enlarged to."""
+_TITLE, _LINE, _ENTRY, _GAP = 24, 20, 300, 10
+"""Pixels of the height of a title and of a line of the legend, of the width of one of its entries, and between panels."""
+
+
+def shares(left_out: Mapping[str, Bool[np.ndarray, "height width"]]) -> dict[str, str]:
+    """In words, how much of a picture is fitted, and how much is left out for each reason."""
+    parts = {reason: float(np.mean(bad)) for reason, bad in left_out.items()}
+    parts = {"fitted": 1 - sum(parts.values())} | parts
+    return {what: f"{100 * part:.2g} %" if part >= 1e-3 else "under 0.1 %" for what, part in parts.items()}
+
+
+def mask_figure(
+    pixels: Float[np.ndarray, "height width 3"], left_out: Mapping[str, Bool[np.ndarray, "height width"]]
+) -> Figure:
+    """A photo, and the same with what is left out of the fit painted by its reason; with the share of each in the picture.
+
+    ``pixels`` are linear red, green, blue in any exposure; of ``left_out`` see :func:`fitting.observation.exclusions`.
+    """
+    label = np.zeros(pixels.shape[:2], dtype=np.uint8)
+    for number, bad in enumerate(left_out.values(), start=1):
+        label[bad] = number
+    tints = np.array([(1.0, 1.0, 1.0), *(TINTS.get(reason, _OTHER) for reason in left_out)])
+    codes = skymask.developed(pixels, label == 0)
+    painted = skymask.painted(codes, label, tints)
+    panels = {"the photo": _sized(codes), "what is fitted, and why the rest is not": _sized(painted)}
+    height, width = panels["the photo"].shape[:2]
+    # One pixel of the picture is one of the figure; a wide one stands above its mask, a high one beside it.
+    rows, columns = (2, 1) if width > height else (1, 2)
+    sheet = np.array([columns * width + (columns - 1) * _GAP, rows * (height + _TITLE)])
+    entries = max(1, sheet[0] // _ENTRY)
+    legend = _LINE * math.ceil(len(tints) / entries) + _GAP
+    sheet[1] += legend
+    figure = Sheet(figsize=tuple(sheet / DPI))
+    for number, (title, picture) in enumerate(panels.items()):
+        row, column = divmod(number, columns)
+        corner = np.array([column * (width + _GAP), legend + (rows - 1 - row) * (height + _TITLE)])
+        axes = figure.add_axes((*(corner / sheet), *(np.array([width, height]) / sheet)))
+        axes.imshow(picture, interpolation="nearest", aspect="auto")
+        bare(axes, title)
+        axes.spines[:].set_visible(False)
+    texts = [f"{what}, {share}" for what, share in shares(left_out).items()]
+    # In its mean colour; what is in so few pixels that none of them is here, in its tint.
+    faces = [painted[label == n].mean(axis=0) if np.any(label == n) else tint for n, tint in enumerate(tints)]
+    handles = [
+        Patch(facecolor=tuple(face), edgecolor="#666", label=text) for face, text in zip(faces, texts, strict=True)
+    ]
+    figure.legend(handles=handles, ncols=entries, loc="lower left", fontsize=8, frameon=False, borderpad=0.2)
+    return figure
+
+
+def _sized(codes: Float[np.ndarray, "height width 3"]) -> Float[np.ndarray, "h w 3"]:
+    """A picture with the longer side of :data:`LONG` pixels at most; of a small one every pixel several times."""
+    from skimage import transform
+
+    longer = max(codes.shape[:2])
+    if longer > LONG:
+        height, width = (max(1, round(side * LONG / longer)) for side in codes.shape[:2])
+        return transform.resize(codes, (height, width), anti_aliasing=True)
+    copies = max(1, SHORT // longer)
+    return codes.repeat(copies, axis=0).repeat(copies, axis=1)
+
+
+def is_scan(observation: Observation) -> bool:
+    """Whether an image is a list of directions, which is no picture: it has a single row."""
+    return len(observation.image) == 1
+
+
 def image_figure(
     observation: Observation, fitted: Image, residual: Image, wavelengths: Sequence[float], scale: float
 ) -> Figure:
     """Measured, what of it is used, and fitted side by side; below the relative residual of each channel, if up to three."""
-    if len(observation.image) == 1:
+    if is_scan(observation):
         return _scan_figure(observation, fitted, residual, scale)
     names = channels(observation, wavelengths)
     unit = " nm" if observation.bands is None else ""

@@ -13,7 +13,6 @@ horizon only.
 """
 
 import math
-from collections import Counter
 from collections.abc import Mapping
 from typing import Any, NamedTuple, Protocol
 
@@ -264,36 +263,24 @@ def observe(
     if exposure.endswith(PER_CHANNEL) and white_balance != FIXED:
         refuse(f"exposure: {exposure!r} has a factor for each channel already, expected white_balance fixed beside it")
 
-    inside = np.asarray(camera.valid(), dtype=bool)
-    zenith = np.arccos(np.clip(directions[..., 2], -1, 1))
-    from_sun = np.arccos(np.clip(directions @ toward_sun, -1, 1))
-    finite = np.all(np.isfinite(image), axis=-1)
-    # The tolerance keeps a pixel whose centre lies on the limit itself.
-    shown = inside & (zenith <= view_zenith_max + 1e-6)
-    steps: list[tuple[str, np.ndarray]] = [
-        ("outside the camera's field of view", ~inside),
-        ("beyond the largest view zenith angle", ~shown),
-        ("not finite", ~finite),
-        ("negative", np.any(image < 0, axis=-1) & (pedestal == FIXED)),
-        ("black", np.all(image == 0, axis=-1)),
-    ]
-    if saturation is not None:
-        steps.append(("saturated", np.any(image >= saturation, axis=-1)))
-    reasons = (
-        mask if isinstance(mask, Mapping) else {} if mask is None else {"masked by the user": ~np.asarray(mask, bool)}
-    )
-    for reason, bad in reasons.items():
+    for bad in _reasons(mask).values():
         if bad.shape != image.shape[:2]:
             refuse(f"mask: got shape {bad.shape}, expected {image.shape[:2]} like the image")
-        steps.append((reason, bad))
-    steps.append(("near the sun", from_sun < sun_exclusion))
-    steps.append(("near the horizon", np.abs(math.pi / 2 - zenith) < horizon_exclusion))
-    used = np.ones(image.shape[:2], dtype=bool)
-    masked: Counter[str] = Counter()
-    for reason, bad in steps:
-        if count := int(np.sum(used & bad)):
-            masked[reason] = count
-        used &= ~bad
+    left_out = exclusions(
+        image,
+        camera=camera,
+        sun=toward_sun,
+        mask=mask,
+        saturation=saturation,
+        sun_exclusion=sun_exclusion,
+        view_zenith_max=view_zenith_max,
+        horizon_exclusion=horizon_exclusion,
+        pedestal=pedestal,
+    )
+    masked = {reason: int(bad.sum()) for reason, bad in left_out.items()}
+    none = np.zeros(image.shape[:2], dtype=bool)
+    used = ~np.any([none, *left_out.values()], axis=0)
+    shown = np.asarray(camera.valid(), dtype=bool) & ~_beyond(directions, view_zenith_max)
     if not used.any():
         why = ", ".join(f"{count} {reason}" for reason, count in masked.items())
         refuse(f"no pixel is left to fit: of {used.size} pixels {why}")
@@ -336,7 +323,7 @@ def observe(
         exposure_value=float(exposure_value),
         altitude=float(altitude),
         sun=toward_sun / np.linalg.norm(toward_sun),
-        masked=dict(masked),
+        masked=masked,
         block=block,
         camera=camera,
         bands=bands,
@@ -379,6 +366,66 @@ def _per_pixel(refuse: _Refusal, key: str, value: float | np.ndarray, shape: tup
     if not np.all(np.isfinite(array)) or np.any(array < 0):
         refuse(f"{key}: expected finite numbers >= 0")
     return array
+
+
+def exclusions(
+    image: Float[np.ndarray, "height width w"],
+    *,
+    camera: Camera,
+    sun: Float[np.ndarray, "3"],
+    mask: Bool[np.ndarray, "height width"] | Mapping[str, Bool[np.ndarray, "height width"]] | None = None,
+    saturation: float | None = None,
+    sun_exclusion: float = SUN_EXCLUSION,
+    view_zenith_max: float = math.pi / 2,
+    horizon_exclusion: float = 0.0,
+    pedestal: str = FIXED,
+) -> dict[str, Bool[np.ndarray, "height width"]]:
+    """The pixels of an image that :func:`observe` leaves out, by reason, with its arguments; without empty ones.
+
+    Each pixel is under the first reason that holds for it.
+    """
+    directions = np.asarray(camera.directions(), dtype=np.float32)
+    from_sun = np.arccos(np.clip(directions @ sun, -1, 1))
+    steps: list[tuple[str, np.ndarray]] = [
+        ("outside the camera's field of view", ~np.asarray(camera.valid(), dtype=bool)),
+        (
+            "below the horizon" if view_zenith_max == math.pi / 2 else "beyond the largest view zenith angle",
+            _beyond(directions, view_zenith_max),
+        ),
+        ("not finite", ~np.all(np.isfinite(image), axis=-1)),
+        ("negative", np.any(image < 0, axis=-1) & (pedestal == FIXED)),
+        ("black", np.all(image == 0, axis=-1)),
+    ]
+    if saturation is not None:
+        steps.append(("saturated", np.any(image >= saturation, axis=-1)))
+    steps += _reasons(mask).items()
+    steps.append(("near the sun", from_sun < sun_exclusion))
+    steps.append(("near the horizon", np.abs(math.pi / 2 - _zenith(directions)) < horizon_exclusion))
+    used = np.ones(image.shape[:2], dtype=bool)
+    found: dict[str, np.ndarray] = {}
+    for reason, bad in steps:
+        if np.any(used & bad):
+            found[reason] = found[reason] | (used & bad) if reason in found else used & bad
+        used &= ~bad
+    return found
+
+
+def _zenith(directions: Float[np.ndarray, "height width 3"]) -> Float[np.ndarray, "height width"]:
+    return np.arccos(np.clip(directions[..., 2], -1, 1))
+
+
+def _beyond(
+    directions: Float[np.ndarray, "height width 3"], view_zenith_max: float
+) -> Bool[np.ndarray, "height width"]:
+    """Where the view is lower than it may be; a pixel whose centre lies on the limit itself is not."""
+    return _zenith(directions) > view_zenith_max + 1e-6
+
+
+def _reasons(mask: np.ndarray | Mapping[str, np.ndarray] | None) -> Mapping[str, np.ndarray]:
+    """What a mask leaves out, by reason."""
+    if mask is None or isinstance(mask, Mapping):
+        return mask or {}
+    return {"masked by the user": ~np.asarray(mask, bool)}
 
 
 def light_of(pixels: Float[np.ndarray, "pixel w"], pedestal: str = FREE) -> Float[np.ndarray, "pixel w"]:

@@ -6,7 +6,9 @@
 - ``atmosphere.toml``, the fitted atmosphere as every other command reads it,
 - ``fitted_<image>.exr`` and ``.png``, what the images should look like, and ``residual_<image>.exr`` and ``.png``,
   measured / fitted - 1,
+- of a scan, whose pixels are no picture, ``fitted_<image>.png`` alone: what was measured and fitted, and where it differs,
 - ``profile_<name>.png`` of every profile likelihood,
+- what the caller adds: figures (:class:`Plate`), for which ``mask.png`` and names that begin with ``mask_`` are reserved,
 - ``report.html``, self-contained.
 
 ``fit.json`` holds finite numbers or null, under the keys
@@ -37,8 +39,8 @@
 ``minima``            ``chi2`` and ``values`` of each, the best first, if the search found several
 ``images``            for each: place, sun as given, which nuisances are free, how many exposures it was merged
                       from, masked pixels by reason, pixels that a robust loss takes for outliers, and ``residuals``: per
-                      wavelength the median and the root mean square of measured / fitted - 1, and the root mean square in
-                      sigmas
+                      wavelength the median and the root mean square of measured / fitted - 1, the median of its absolute
+                      value, and the root mean square in sigmas
 ``timings``           seconds: ``compile_s``, ``solve_s``, ``total_s``
 ====================  ================================================================================================
 """
@@ -51,7 +53,7 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -71,21 +73,35 @@ from fitting.figures import (
     diverging,
     histogram_figure,
     image_figure,
+    is_scan,
     profile_figure,
     residual_scale,
 )
-from fitting.findings import NINETY_FIVE, ONE_SIGMA, Estimate, Findings, Profile
+from fitting.findings import NINETY_FIVE, ONE_SIGMA, Estimate, Findings
 from fitting.nuisances import KINDS, group_of
 from fitting.observation import FIXED, PER_CHANNEL, Observation
 from fitting.storage import installed_version
-from fitting.tables import doubts, notes, page_table, profile_text, table, verdict
+from fitting.tables import (
+    MANY,
+    doubts,
+    notes,
+    overview,
+    page_overview,
+    page_table,
+    profile_text,
+    residual_text,
+    table,
+    verdict,
+)
 
 __all__ = [
     "STYLE",
+    "Plate",
     "check_writable",
     "doubts",
     "figure_tag",
     "file_names",
+    "overview",
     "page",
     "record",
     "scene_of",
@@ -95,8 +111,16 @@ __all__ = [
 
 SCHEMA, SCHEMA_VERSION = "diffatmo-fit", 2
 
-FIXED_NAMES = ("fit.json", "atmosphere.toml", "report.html")
-IMAGE_PREFIXES = ("fitted_", "residual_", "profile_")
+FIXED_NAMES = ("fit.json", "atmosphere.toml", "report.html", "mask.png")
+IMAGE_PREFIXES = ("fitted_", "residual_", "profile_", "mask_")
+
+
+class Plate(NamedTuple):
+    """A figure that the caller has of what was fitted: a file of the report, and the first thing on its page."""
+
+    file: str
+    figure: Figure
+    caption: str
 
 
 def check_writable(directory: str | Path, *, overwrite: bool = False) -> Path:
@@ -113,9 +137,14 @@ def check_writable(directory: str | Path, *, overwrite: bool = False) -> Path:
 
 
 def write(
-    result: Findings, directory: str | Path, *, truth: Atmosphere | None = None, overwrite: bool = False
+    result: Findings,
+    directory: str | Path,
+    *,
+    truth: Atmosphere | None = None,
+    plates: Sequence[Plate] = (),
+    overwrite: bool = False,
 ) -> list[Path]:
-    """Write all files of the report and return their paths.
+    """Write all files of the report, ``plates`` among them, and return their paths.
 
     Every file appears whole or not at all. If one cannot be written the others still are, and then ``OSError`` names
     those that are missing.
@@ -142,10 +171,10 @@ def write(
         bands = wavelengths if of.bands is None else None if len(of.bands.names) == 3 else of.bands.centres
         return lambda file: imageio.write_exr(file, pixels, wavelengths=bands, overwrite=overwrite)
 
-    def chart(profile: Profile) -> Callable[[Path], None]:
+    def chart(figure: Figure) -> Callable[[Path], None]:
         def task(file: Path) -> None:
             with imageio.atomic_write(file, overwrite=overwrite) as temporary:
-                temporary.write_bytes(as_png(profile_figure([profile])))
+                temporary.write_bytes(as_png(figure))
 
         return task
 
@@ -157,12 +186,17 @@ def write(
         file_names(result.observations), result.observations, result.fitted, result.residuals, strict=True
     ):
         tasks[f"fitted_{name}.exr"] = exr(fitted, observation, scene_of(result, observation))
-        tasks[f"fitted_{name}.png"] = png(developed(observation, fitted, wavelengths)[1])
         tasks[f"residual_{name}.exr"] = exr(residual, observation, None)
-        tasks[f"residual_{name}.png"] = png(diverging(np.mean(residual, axis=-1), scale))
+        if is_scan(observation):
+            tasks[f"fitted_{name}.png"] = chart(image_figure(observation, fitted, residual, wavelengths, scale))
+        else:
+            tasks[f"fitted_{name}.png"] = png(developed(observation, fitted, wavelengths)[1])
+            tasks[f"residual_{name}.png"] = png(diverging(np.mean(residual, axis=-1), scale))
     for profile in result.profiles:
-        tasks[f"profile_{profile.name}.png"] = chart(profile)
-    tasks["report.html"] = text(lambda: page(result))
+        tasks[f"profile_{profile.name}.png"] = chart(profile_figure([profile]))
+    for plate in plates:
+        tasks[plate.file] = chart(plate.figure)
+    tasks["report.html"] = text(lambda: page(result, plates))
     failures = []
     for file, task in tasks.items():
         try:
@@ -320,13 +354,14 @@ th:nth-child(-n+2), td:nth-child(-n+2) { text-align: left; } tr.rule td { border
 """
 
 
-def page(result: Findings) -> str:
+def page(result: Findings, plates: Sequence[Plate] = ()) -> str:
     """The report as one HTML document that needs nothing else."""
     wavelengths = [float(nm) for nm in result.atmosphere.wavelengths]
     scale = residual_scale(result.residuals)
     images = [
         figure_tag(
-            image_figure(o, fitted, residual, wavelengths, scale), _caption(o, fitted, _image_record(result, number))
+            image_figure(o, fitted, residual, wavelengths, scale),
+            _caption(o, fitted, _image_record(result, number), wavelengths),
         )
         for number, (o, fitted, residual) in enumerate(
             zip(result.observations, result.fitted, result.residuals, strict=True)
@@ -339,6 +374,8 @@ def page(result: Findings) -> str:
         "<h1>Which atmosphere made this sky?</h1>",
         f"<p class={'good' if result.converged else 'bad'}><strong>{verdict(result)}.</strong></p>",
         f"<p class=soft>{html.escape(result.message)}. Time: {seconds}.</p>",
+        page_overview(result),
+        *(figure_tag(plate.figure, plate.caption) for plate in plates),
         "".join(f"<p>{html.escape(note)}</p>" for note in notes(result)),
         "<h2>Parameters</h2>",
         page_table(result),
@@ -376,31 +413,23 @@ def figure_tag(figure: Figure, caption: str) -> str:
     return f"<figure><img src='data:image/png;base64,{picture}' alt=''><figcaption>{html.escape(caption)}</figcaption></figure>"
 
 
-MANY = 12
-"""Channels beyond which the median of their residuals is told instead of each."""
-
-
-def _residuals_text(observation: Observation, fitted: np.ndarray, about: dict[str, Any]) -> str:
+def _residuals_text(
+    observation: Observation, fitted: np.ndarray, about: dict[str, Any], wavelengths: Sequence[float]
+) -> str:
     """The residuals of an image in words: of each channel, or, of a spectrometer's many, of all of them."""
     relative, of_sigma = (np.asarray(about["residuals"][key]) for key in ("median_absolute_relative", "rms_sigma"))
-    relative = 100 * relative
+    told = f"Residuals: {residual_text(observation, relative, wavelengths)}"
     if relative.size > MANY:
         used = observation.used
         off = math.sqrt(np.mean((fitted - observation.image)[used].astype(float) ** 2))
         return (
-            f"Median |residual| of a channel: {np.median(relative):.2g} %, at most {relative.max():.2g} %; RMS residual "
-            f"{off:.2g} of a mean of {observation.image[used].mean(dtype=float):.2g} in the units of the measurement; over "
-            f"stated noise, RMS: {np.sqrt(np.mean(of_sigma**2)):.2g}."
+            f"{told}; RMS {off:.2g} of a mean of {observation.image[used].mean(dtype=float):.2g} in the units of the "
+            f"measurement; over stated noise, RMS: {np.sqrt(np.mean(of_sigma**2)):.2g}."
         )
-    of = "wavelength" if observation.bands is None else ", ".join(observation.bands.names)
-    return (
-        f"Median |residual| {'per ' if observation.bands is None else ''}{of}: "
-        f"{', '.join(f'{value:.2g}' for value in relative)} %; residual over stated noise, RMS: "
-        f"{', '.join(f'{value:.2g}' for value in of_sigma)}."
-    )
+    return f"{told}; over stated noise, RMS: {', '.join(f'{value:.2g}' for value in of_sigma)}."
 
 
-def _caption(observation: Observation, fitted: np.ndarray, about: dict[str, Any]) -> str:
+def _caption(observation: Observation, fitted: np.ndarray, about: dict[str, Any], wavelengths: Sequence[float]) -> str:
     masked = ", ".join(f"{count} {reason}" for reason, count in observation.masked.items())
     merged = f"merged from {observation.merged} files; " if observation.merged > 1 else ""
     binned = f" (blocks of {observation.block} × {observation.block})" if observation.block > 1 else ""
@@ -411,5 +440,5 @@ def _caption(observation: Observation, fitted: np.ndarray, about: dict[str, Any]
         f"{observation.name}: {merged}sun at zenith angle {about['sun_zenith_deg']:.1f}°, azimuth "
         f"{about['sun_azimuth_deg']:.1f}°; altitude {observation.altitude:g} km; {free}; "
         f"{about['pixels_used']} pixels used{binned}{outlying}{f', left out: {masked}' if masked else ''}. "
-        f"{_residuals_text(observation, fitted, about)}"
+        f"{_residuals_text(observation, fitted, about, wavelengths)}"
     )

@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 from rich.box import SIMPLE_HEAD
-from rich.console import Console
+from rich.console import Console, Group
 from rich.table import Table
 from rich.text import Text
 from scipy.special import chdtri
@@ -20,8 +21,10 @@ from diffatmo.atmosphere import Atmosphere
 from fitting._errors import FitError
 from fitting.combinations import combinations
 from fitting.findings import NINETY_FIVE, ONE_SIGMA, Estimate, Findings, Minimum, Profile
-from fitting.nuisances import EACH
+from fitting.nuisances import EACH, channels
+from fitting.observation import Observation
 from fitting.priors import Prior
+from fitting.quantities import REFERENCE_NM
 
 SURPRISING, UNLIKELY = 0.01, 2.0
 """Probability below which what was found contradicts what was known beforehand, and standard errors from which a number is told
@@ -32,6 +35,17 @@ POOR = 0.1
 
 FAR = 3.0
 """Standard errors from the truth beyond which an estimate is marked."""
+
+HEADLINE = {
+    f"mie_optical_depth_{REFERENCE_NM:g}": f"aerosol optical depth at {REFERENCE_NM:g} nm",
+    "mie_angstrom_exponent": "Ångström exponent of the aerosol",
+    "visibility": "visibility at the ground",
+    "turbidity": "turbidity",
+}
+"""Numbers that are asked for first, and what they are called."""
+
+MANY = 12
+"""Channels beyond which the median of their residuals is told instead of each."""
 
 PLAIN_WIDTH = 100
 """Columns of the plain text: enough for the table with all its columns, and a number that is not determined."""
@@ -130,6 +144,71 @@ def verdict(result: Findings) -> str:
     """How the fit ended, in one line."""
     state = "Converged" if result.converged else "Not converged"
     return f"{state} after {result.iterations} iterations, reduced χ² = {result.reduced_chi2:.3f}"
+
+
+class _Headline(NamedTuple):
+    """A number that stands above the table, as text."""
+
+    what: str
+    value: str
+    images: str
+
+
+def _headlines(result: Findings) -> list[_Headline]:
+    """The numbers of :data:`HEADLINE` that the fit has."""
+    found = []
+    for estimate in result.parameters:
+        if estimate.name not in HEADLINE:
+            continue
+        error = estimate.standard_error
+        value = f"{format_number(estimate.value, error)} ± {error:.2g}" if error else format_number(estimate.value)
+        value += f" {estimate.unit}" * bool(estimate.unit)
+        value += ", at its bound" if estimate.at_bound else ", not determined" if error is None else ""
+        share = estimate.data_share if result.priors else None
+        images = "" if share is None else f"{100 * share:.0f} % by images"
+        found.append(_Headline(HEADLINE[estimate.name], value, images))
+    return found
+
+
+def residual_text(observation: Observation, relative: Float[np.ndarray, " w"], wavelengths: Sequence[float]) -> str:
+    """The residuals of an image in words, from the median of their absolute values, ``relative``, in each channel."""
+    percent = 100 * relative
+    told = "median |measured / fitted − 1|"
+    if percent.size > MANY:
+        return f"{told} of a channel {np.median(percent):.2g} %, at most {percent.max():.2g} %"
+    unit = " nm" if observation.bands is None else ""
+    names = channels(observation, wavelengths)
+    return f"{told} " + ", ".join(f"{name}{unit} {value:.2g} %" for name, value in zip(names, percent, strict=True))
+
+
+def _residual_lines(result: Findings) -> list[str]:
+    """A line for each image."""
+    wavelengths = [float(nm) for nm in result.atmosphere.wavelengths]
+    several = len(result.observations) > 1
+    lines = []
+    for observation, residual in zip(result.observations, result.residuals, strict=True):
+        median = np.median(np.abs(residual[observation.used].astype(float)), axis=0)
+        of = f" of {observation.name}" * several
+        lines.append(f"residuals{of}: {residual_text(observation, median, wavelengths)}")
+    return lines
+
+
+def overview(result: Findings) -> Group:
+    """What stands above the table in a terminal: the numbers that are asked for first, and the residuals in percent."""
+    grid = Table.grid(padding=(0, 3, 0, 0))
+    for line in _headlines(result):
+        grid.add_row(*map(Text, line))
+    return Group(*([grid] if grid.rows else []), *map(Text, _residual_lines(result)))
+
+
+def page_overview(result: Findings) -> str:
+    """The same as HTML."""
+    rows = "".join(
+        f"<tr><td>{what}</td><td><strong>{value}</strong></td><td>{images}</td></tr>"
+        for what, value, images in _headlines(result)
+    )
+    lines = "".join(f"<p>{html.escape(line)}</p>" for line in _residual_lines(result))
+    return (f"<table>{rows}</table>" if rows else "") + lines
 
 
 def _told_beforehand(result: Findings, prior: Prior) -> list[Estimate]:
@@ -284,18 +363,18 @@ def _remarks(result: Findings) -> list[str]:
 
 
 def text(result: Findings) -> str:
-    """The table and the notes as plain text, for any display."""
+    """The overview, the table and the notes as plain text, for any display."""
     stream = io.StringIO()
     console = Console(
         file=stream, width=PLAIN_WIDTH, color_system=None, force_terminal=False, force_jupyter=False, highlight=False
     )
-    console.print(table(result), *_remarks(result), sep="\n", markup=False)
+    console.print(overview(result), table(result), *_remarks(result), sep="\n", markup=False)
     return "\n".join(line.rstrip() for line in stream.getvalue().rstrip().splitlines())
 
 
 def fragment(result: Findings) -> str:
-    """How the fit ended, the table and the notes as HTML, for a notebook."""
-    lines = [f"<p><strong>{verdict(result)}.</strong></p>", page_table(result)]
+    """How the fit ended, the overview, the table and the notes as HTML, for a notebook."""
+    lines = [f"<p><strong>{verdict(result)}.</strong></p>", page_overview(result), page_table(result)]
     return "\n".join(lines + [f"<p>{html.escape(note)}</p>" for note in _remarks(result)])
 
 

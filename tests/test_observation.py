@@ -41,7 +41,7 @@ def test_pixels_are_masked_for_the_first_reason_that_applies():
     mask[0, :8] = False
     found = observe(pixels, saturation=50.0, mask=mask)
     assert found.masked == {
-        "beyond the largest view zenith angle": 16 * 64,
+        "below the horizon": 16 * 64,
         "not finite": 2,
         "negative": 1,
         "black": 1,

@@ -18,7 +18,7 @@ from diffatmo.cli.common import (
     printable,
     read_atmosphere,
 )
-from diffatmo.cli.images import observe, observe_photo, open_image, stated
+from diffatmo.cli.images import View, observe, observe_photo, open_image, stated
 from diffatmo.cli.scenefile import (
     FREE,
     IMAGE_KEYS,
@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from diffatmo.models import Model
     from fitting import Observation, Prior, Step
     from fitting.parameters import Parameters
+    from fitting.report import Plate
 
 NOT_CONVERGED = 1
 MAX_STEPS = 100
@@ -282,6 +283,8 @@ class Job:
     photos: bool = False
     assumed: tuple[str, ...] = ()
     """What was taken from photos or from experience, in words."""
+    views: tuple[View, ...] = ()
+    """Of each photo, as it is looked at."""
 
 
 class Choice(NamedTuple):
@@ -354,6 +357,7 @@ def prepare(spec: FitSpec) -> Job:
         refine=not photos and any(image.model != model for image in seen),
         photos=photos,
         assumed=tuple(f"{image.observation.name}: {line}" for image in seen for line in image.assumed),
+        views=tuple(image.view for image in seen if image.view is not None),
         max_steps=spec.max_steps or MAX_STEPS,
         starts=spec.starts,
         profile=chosen.profile,
@@ -536,9 +540,10 @@ def run(job: Job, directory: Path, *, overwrite: bool, quiet: bool = False, writ
         status = INTERRUPTED if interrupted else 0 if result.converged else NOT_CONVERGED
         if not write:
             return status
-        report.write(result, directory, truth=job.truth, overwrite=overwrite)
+        report.write(result, directory, truth=job.truth, plates=plates(job), overwrite=overwrite)
     if not interrupted:
         file.unlink(missing_ok=True)
+    console.print(report.overview(result))
     console.print(report.table(result, job.truth))
     for doubt in report.doubts(result):
         console.print(f"Doubtful: {doubt}", soft_wrap=True)
@@ -546,6 +551,26 @@ def run(job: Job, directory: Path, *, overwrite: bool, quiet: bool = False, writ
         console.print(f"{result.message}{'; the same command with --resume goes on' * interrupted}", soft_wrap=True)
     console.print(f"Report: {directory / 'report.html'}", soft_wrap=True)
     return status
+
+
+def plates(job: Job) -> "list[Plate]":
+    """Each photo beside what of it is fitted: ``mask.png``, or of several ``mask_<image>.png``."""
+    from fitting.figures import mask_figure, shares
+    from fitting.report import Plate, file_names
+
+    found: list[Plate] = []
+    for name, view in zip(file_names(job.observations), job.views, strict=False):
+        file = "mask.png" if len(job.views) == 1 else f"mask_{name}.png"
+        fitted, *others = (f"{share} {what}" for what, share in shares(view.left_out).items())
+        parts = fitted + f"; left out {', '.join(others)}" * bool(others)
+        by = (
+            "What is sky is what --mask says."
+            if view.own_mask
+            else "If sky was taken for something else, or something else for sky, give --mask: a picture of the size of the "
+            "photo, black where pixels are to be left out."
+        )
+        found.append(Plate(file, mask_figure(view.pixels, view.left_out), f"{name}: of the picture {parts}. {by}"))
+    return found
 
 
 def run_quietly(job: Job, directory: Path, overwrite: bool) -> None:

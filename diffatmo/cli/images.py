@@ -64,6 +64,12 @@ ANGLES = (
 )
 """What :func:`fitting.observe` takes as it is, and what it takes in radians."""
 
+EXCLUDING = ("pedestal", "saturation", "sun_exclusion", "view_zenith_max", "horizon_exclusion")
+"""What of it says which pixels are left out."""
+
+MOST_SHOWN = 2048
+"""Pixels of the longer side of a photo that is kept to be looked at."""
+
 EXPONENT_ERROR = 0.03
 """Of a transfer function that a bracket confirms: over a factor of 5 that is the 5 % by which a photo is off anyway."""
 
@@ -91,6 +97,17 @@ class Opened(NamedTuple):
         return self.shot is None and is_photo(self.image)
 
 
+class View(NamedTuple):
+    """A photo as it is looked at: its pixels, and those that are left out of the fit."""
+
+    pixels: "np.ndarray"
+    """Linear, red, green and blue."""
+    left_out: "Mapping[str, np.ndarray]"
+    """By reason (:func:`fitting.observation.exclusions`)."""
+    own_mask: bool
+    """Whether the user said which pixels are sky."""
+
+
 class Seen(NamedTuple):
     """An image to be fitted, and what its header says about where it comes from."""
 
@@ -100,6 +117,8 @@ class Seen(NamedTuple):
     """That rendered it."""
     assumed: tuple[str, ...] = ()
     """What was merged, and what was assumed of a photo, in words."""
+    view: View | None = None
+    """Of a photo."""
 
 
 def open_image(spec: ImageSpec, *, may_be_photo: bool) -> Opened:
@@ -172,6 +191,7 @@ def observe_photo(opened: Opened, name: str) -> Seen:
 
     import fitting
     from diffatmo import sun
+    from fitting.observation import exclusions
 
     spec = opened.spec
     try:
@@ -196,23 +216,27 @@ def observe_photo(opened: Opened, name: str) -> Seen:
         else:
             found = find_mask(photo.pixels, camera, towards, options)
             mask = {reason: found.label == number for number, reason in enumerate(found.reasons) if number}
+        chosen = stated(options)
+        seen_from: dict[str, Any] = {"camera": camera, "sun": np.asarray(towards), "mask": mask}
         observation = fitting.observe(
             photo.pixels,
-            camera=camera,
+            **seen_from,
             altitude=options["altitude_km"],
-            sun=np.asarray(towards),
-            mask=mask,
             bands=seeing,
             max_pixels=MAX_PIXELS,
             name=name,
             merged=len(spec.files),
-            **_with_known(photo.noise, stated(options)),
+            **_with_known(photo.noise, chosen),
         )
     except ValueError as error:
         raise InputError(f"{spec.file}: {str(error).removeprefix(f'{name}: ')}") from error
     if "noise" not in spec.options:
         observation = replace(observation, noise=shared_noise(observation))
-    return Seen(observation, assumed=tuple(assumed))
+    left_out = exclusions(photo.pixels, **seen_from, **{key: chosen[key] for key in EXCLUDING if key in chosen})
+    # A photo with a mask has all its pixels; more than a screen has are not looked at.
+    few = slice(None, None, max(1, max(photo.pixels.shape) // MOST_SHOWN))
+    view = View(photo.pixels[few, few], {reason: bad[few, few] for reason, bad in left_out.items()}, "mask" in options)
+    return Seen(observation, assumed=tuple(assumed), view=view)
 
 
 def _sun_of(

@@ -256,7 +256,11 @@ def _told(row: results.Row) -> str:
     if row["status"] == results.FAILED:
         return f"failed: {row['message']}"
     message = "" if row["status"] == results.CONVERGED else f" ({row['message']})"
-    return f"{row['status']}{message}, reduced χ² {row['reduced_chi2']:.4g}, {row['seconds']:.1f} s"
+    doubtful = ", doubtful" * bool(row["doubts"])
+    residual = f"residual {row['residual_percent']:.2g} %"
+    return (
+        f"{row['status']}{message}{doubtful}, reduced χ² {row['reduced_chi2']:.4g}, {residual}, {row['seconds']:.1f} s"
+    )
 
 
 def _count(tasks: Sequence[Task]) -> str:

@@ -12,8 +12,9 @@ from diffatmo.cli.common import printable
 
 FILE = "results.csv"
 RECORD = "fit.json"
-COLUMNS = ("file", "status", "message", "reduced_chi2", "seconds")
-"""Of every row; then come the numbers that were fitted and what follows from them, each with its standard error."""
+COLUMNS = ("file", "status", "message", "doubts", "reduced_chi2", "residual_percent", "seconds")
+"""Of every row; ``residual_percent`` is the median of abs(measured / fitted - 1) in the channel where it is largest. Then come
+the numbers that were fitted and what follows from them, each with its standard error."""
 
 STATES = CONVERGED, NOT_CONVERGED, FAILED = "converged", "not converged", "failed"
 
@@ -28,7 +29,9 @@ def row(file: Path, directory: Path) -> Row | None:
             "file": printable(file),
             "status": CONVERGED if record["converged"] else NOT_CONVERGED,
             "message": record["message"],
+            "doubts": " ".join(record["doubts"]),
             "reduced_chi2": record["reduced_chi2"],
+            "residual_percent": 100 * max(record["images"][0]["residuals"]["median_absolute_relative"]),
             "seconds": round(record["timings"]["total_s"], 3),
             **_numbers(record),
         }
