@@ -117,7 +117,7 @@ def mask_figure(
     tints = np.array([(1.0, 1.0, 1.0), *(TINTS.get(reason, _OTHER) for reason in left_out)])
     codes = skymask.developed(pixels, label == 0)
     painted = skymask.painted(codes, label, tints)
-    panels = {"the photo": _sized(codes), "what is fitted, and why the rest is not": _sized(painted)}
+    panels = {"the photo": _sized(codes), "what of it is fitted": _sized(painted)}
     height, width = panels["the photo"].shape[:2]
     # One pixel of the picture is one of the figure; a wide one stands above its mask, a high one beside it.
     rows, columns = (2, 1) if width > height else (1, 2)

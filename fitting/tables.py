@@ -277,8 +277,13 @@ def doubts(result: Findings) -> list[str]:
 
 
 def notes(result: Findings) -> list[str]:
-    """In words, what a reader of the table must know."""
-    found = doubts(result)
+    """In words, what a reader of the table must know: first the doubts."""
+    return [*doubts(result), *explanations(result)]
+
+
+def explanations(result: Findings) -> list[str]:
+    """In words, what a reader of the table must know besides the doubts."""
+    found = list[str]()
     if result.undetermined:
         found.append(f"The images do not determine {', '.join(result.undetermined)}.")
     if held := [e.name for e in result.parameters if e.at_bound]:

@@ -59,7 +59,8 @@ def record(name, value, **exposures):
             "parameters": {"mie_g": entry(value, 0.1), "ozone_absorption": entry([1.0, value], [0.5, None])},
             "derived": {},
             "nuisances": {key: entry(item, 0.2) for key, item in exposures.items()},
-            "images": [{"name": name}],
+            "doubts": ["It is a stub.", "So it is."],
+            "images": [{"name": name, "residuals": {"median_absolute_relative": [0.02, 0.03, 0.01]}}],
             "timings": {"total_s": 0.1234567},
         }
     )

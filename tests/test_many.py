@@ -292,7 +292,9 @@ def test_table(tmp_path):
     assert found.pop() is None
     failed = results.failure(Path("bad\udcff.exr"), 'a "quoted", message\udcff')
     first, second, third, fourth = csv.DictReader(io.StringIO(results.dumps([*found, failed])))
-    assert list(first)[:5] == ["file", "status", "message", "reduced_chi2", "seconds"]
+    assert tuple(list(first)[:7]) == results.COLUMNS
+    # The residual is that of the worst of the channels.
+    assert (first["doubts"], float(first["residual_percent"])) == ("It is a stub. So it is.", 3.0)
     assert (first["status"], first["seconds"], first["exposure"]) == ("converged", "0.123", "2.0")
     assert (first["ozone_absorption_680"], first["ozone_absorption_680_standard_error"]) == ("1.0", "0.5")
     assert (first["ozone_absorption_550.5"], first["ozone_absorption_550.5_standard_error"]) == ("0.5", "")

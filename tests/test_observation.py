@@ -12,7 +12,7 @@ from diffatmo.camera import Equirectangular, Fisheye
 from fitting import FitError
 from fitting.batch import stack
 from fitting.nuisances import gather
-from fitting.observation import sigma, unstack
+from fitting.observation import exclusions, sigma, unstack
 
 CAMERA = Equirectangular(32, 64)
 SUN = sun.direction(zenith=math.radians(40), azimuth=0.0)
@@ -49,6 +49,27 @@ def test_pixels_are_masked_for_the_first_reason_that_applies():
         "masked by the user": 3,
     }
     assert found.used.sum() == 16 * 64 - 8
+
+
+def test_every_pixel_has_one_reason_or_is_used():
+    """Also one that two reasons name, and one that is named twice."""
+    pixels = np.ones((32, 64, 3))
+    pixels[0, 4, 1] = 50
+    pixels[0, :2] = np.nan
+    clipped, cloud = np.zeros((2, 32, 64), bool)
+    clipped[0, :8] = cloud[0, 6:12] = True
+    given = {"saturation": 50.0, "mask": {"saturated": clipped, "cloud": cloud}, "horizon_exclusion": math.radians(10)}
+    found = observe(pixels, **given)
+    left_out = exclusions(pixels, camera=CAMERA, sun=found.sun, sun_exclusion=0.0, **given)
+    assert {reason: bad.sum() for reason, bad in left_out.items()} == found.masked
+    assert found.masked == {
+        "below the horizon": 16 * 64,
+        "not finite": 2,
+        "saturated": 6,
+        "cloud": 4,
+        "near the horizon": 2 * 64,
+    }
+    np.testing.assert_array_equal(sum(bad.astype(int) for bad in left_out.values()), ~found.used)
 
 
 def test_the_disc_around_the_sun():

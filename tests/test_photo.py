@@ -14,8 +14,9 @@ from diffatmo import bands, color, imageio, sun
 from diffatmo.camera import Equirectangular, Pinhole
 from diffatmo.cli import photo
 from diffatmo.cli.common import InputError
+from diffatmo.cli.fit import check_masks, plates, prepare
 from diffatmo.cli.images import find_camera
-from diffatmo.cli.scenefile import check_image_options
+from diffatmo.cli.scenefile import FitSpec, ImageSpec, check_image_options
 from diffatmo.exif import Exif
 from diffatmo.imageio import Image
 from diffatmo.skymask import Horizon
@@ -425,3 +426,50 @@ def test_a_mask_leaves_out_what_is_not_sky(monkeypatch):
     np.testing.assert_allclose(panorama["from_sun"], np.pi / 2 - panorama["elevation"], atol=1e-3)
     assert picture["elevation"] is None
     assert picture["saturation"] == 0.9
+
+
+def photographed(tmp_path, **options):
+    """A photo of a sky over a sea, as it is fitted."""
+    height, width = 96, 128
+    rows = np.arange(height)[:, None, None]
+    sky = np.array([0.25, 0.45, 0.9]) * np.ones((height, width, 1)) * (0.6 + 0.4 * rows / height)
+    rough = np.exp(0.3 * np.random.default_rng(0).normal(size=(height, width, 1)))
+    pixels = np.where(rows < 72, sky, np.array([0.05, 0.1, 0.12]) * rough).astype(np.float32)
+    imageio.write_png(tmp_path / "sea.png", color.srgb_encode(pixels))
+    said = {"projection": "pinhole", "fov_deg": 40.0, "yaw_deg": 0.0, "pitch_deg": 10.0, "transfer": "srgb"}
+    said |= {"sun_zenith_deg": 40.0, "sun_azimuth_deg": 180.0}
+    return prepare(FitSpec((ImageSpec(tmp_path / "sea.png", said | options),)))
+
+
+def test_a_photo_is_shown_with_what_is_left_out_of_it(tmp_path):
+    """Every pixel is counted once, in the report as in the fit."""
+    job = photographed(tmp_path)
+    (plate,), (view,), (seen,) = plates(job), job.views, job.observations
+    assert view.pixels.shape == (96, 128, 3)
+    assert {reason: bad.sum() for reason, bad in view.left_out.items()} == seen.masked
+    assert plate.file == "mask.png"
+    assert plate.caption.startswith("sea: of the picture ")
+    assert "left out " in plate.caption
+    assert "below the horizon" in plate.caption
+    assert "give --mask: a picture of the size of the photo, black where" in plate.caption
+
+
+def test_a_mask_of_the_user_is_the_one_that_is_shown(tmp_path):
+    mask = np.zeros((96, 128, 3))
+    mask[:40] = 1
+    imageio.write_png(tmp_path / "sky.png", mask)
+    job = photographed(tmp_path, mask=str(tmp_path / "sky.png"))
+    (plate,), (view,) = plates(job), job.views
+    assert "masked by the user" in view.left_out
+    assert "ground or object" not in view.left_out
+    assert not view.left_out["masked by the user"][:40].any()
+    assert plate.caption.endswith("What is sky is what --mask says.")
+
+
+def test_a_mask_is_not_replaced_by_its_picture(tmp_path):
+    spec = FitSpec((ImageSpec(tmp_path / "a.jpg", {"mask": str(tmp_path / "out" / "mask.png")}),))
+    with pytest.raises(
+        InputError, match=r"mask: .*mask\.png bears the name of a file of the report, expected one outside"
+    ):
+        check_masks(spec, tmp_path / "out")
+    check_masks(spec, tmp_path / "elsewhere")

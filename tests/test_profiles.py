@@ -9,6 +9,7 @@ import toy_sky
 from pattern_model import Pattern, observation
 
 from fitting import FitError, FitResult, Prior, fit, profile, report
+from fitting.tables import notes
 
 LINEAR = {"ground_albedo": "grey", "ozone_absorption": "start"}
 
@@ -79,7 +80,7 @@ def test_interval_is_asymmetric_where_the_number_enters_by_its_inverse():
     assert found.differs
     low, high = found.interval(0.95)
     assert (high - found.value) > 1.5 * (found.value - low)
-    assert "not the" in report.notes(result)[-2 if "Better known" in report.notes(result)[-1] else -1]
+    assert "not the" in notes(result)[-2 if "Better known" in notes(result)[-1] else -1]
 
 
 def test_open_interval_is_said_to_be_open():
@@ -88,7 +89,7 @@ def test_open_interval_is_said_to_be_open():
     low, high = found.interval(0.95)
     assert low is not None
     assert high is None
-    assert any("open where" in note for note in report.notes(result))
+    assert any("open where" in note for note in notes(result))
 
 
 def test_interval_ends_at_the_bound_of_the_range():

@@ -1,17 +1,23 @@
 """What a fit leaves behind: complete, readable by machines and people, and never over something else."""
 
 import dataclasses
+import io
 import json
 import re
 
 import numpy as np
+import PIL.Image
 import pytest
 import toy_sky
 from rich.console import Console
 
-from diffatmo import atmosphere, color, imageio, scene
-from fitting import FitError, report
-from fitting.tables import format_number
+import fitting
+from diffatmo import atmosphere, color, imageio, scene, skymask
+from diffatmo.scan import Scan
+from fitting import Estimate, FitError, Prior, report
+from fitting.figures import as_png, mask_figure, shares
+from fitting.tables import format_number, fragment
+from fitting.tables import text as plain
 
 
 @pytest.fixture(scope="module")
@@ -109,7 +115,7 @@ def test_what_was_merged_is_said():
     several = [dataclasses.replace(plain.observations[0], merged=3), *plain.observations[1:]]
     images = report.record(dataclasses.replace(plain, observations=several))["images"]
     assert [image["merged_from"] for image in images][:2] == [3, 1]
-    captions = [report._caption(*of) for of in zip(several, plain.fitted, images, strict=True)]
+    captions = [report._caption(*of, [680, 550, 440]) for of in zip(several, plain.fitted, images, strict=True)]
     assert captions[0].startswith(f"{several[0].name}: merged from 3 files; sun at zenith angle")
     assert captions[1].startswith(f"{several[1].name}: sun at zenith angle")
 
@@ -117,9 +123,104 @@ def test_what_was_merged_is_said():
 def test_residuals_of_many_channels_are_told_together():
     found = toy_sky.result()
     spread = {"median_absolute_relative": np.linspace(0.01, 0.03, 21), "rms_sigma": np.full(21, 0.5)}
-    page = report._residuals_text(found.observations[0], found.fitted[0], {"residuals": spread})
-    assert page.startswith("Median |residual| of a channel: 2 %, at most 3 %; RMS residual ")
+    page = report._residuals_text(found.observations[0], found.fitted[0], {"residuals": spread}, [])
+    assert page.startswith("Residuals: median |measured / fitted − 1| of a channel 2 %, at most 3 %; RMS ")
     assert page.endswith("over stated noise, RMS: 0.5.")
+
+
+def headlined(**changes):
+    """A result that has what photographers ask for."""
+    found = toy_sky.result()
+    values = {"mie_optical_depth_550": (0.0764, 0.0049), "visibility": (52.0, 28.0), "turbidity": (1.78, None)}
+    known = [
+        Estimate(name, name, None, "km" * (name == "visibility"), *number, None, derived=True, data_share=0.377)
+        for name, number in values.items()
+    ]
+    return dataclasses.replace(
+        found, parameters=[e for e in found.parameters if e.name not in values] + known, **changes
+    )
+
+
+def test_what_is_asked_for_stands_first():
+    prior = Prior("mie_g", 0.8, 0.1, source="a guess")
+    lines = plain(headlined(priors=[prior])).splitlines()
+    assert lines[0].split("  ")[0] == "aerosol optical depth at 550 nm"
+    assert re.search(r"  0\.0764 ± 0\.0049 +38 % by images$", lines[0])
+    assert re.search(r"^visibility at the ground +52 ± 28 km ", lines[1])
+    assert re.search(r"^turbidity +1\.78, not determined ", lines[2])
+    # By images alone there is nothing to tell apart.
+    assert "by images" not in "".join(plain(headlined()).splitlines()[:3])
+    page = fragment(headlined())
+    assert page.index("0.0764 ± 0.0049") < page.index("residuals of sun 30: median") < page.index("<th>parameter")
+
+
+def test_residuals_are_told_in_percent():
+    """Of an image that is 2 % off everywhere in one channel."""
+    seen = toy_sky.result().observations[0]
+    one = dataclasses.replace(
+        toy_sky.result(), observations=[seen], fitted=[seen.image * np.array([1 / 1.02, 1, 1], np.float32)]
+    )
+    first, line = plain(one).splitlines()[:2]
+    # Also without a tie, where 550 nm is one of the wavelengths.
+    assert re.fullmatch(r"aerosol optical depth at 550 nm +0\.005\d ± 0\.\d+", first)
+    assert line == "residuals: median |measured / fitted − 1| 680 nm 2 %, 550 nm 0 %, 440 nm 0 %"
+
+
+def test_a_photo_and_its_mask():
+    """A pixel of the picture is one of the figure; what is left out is painted, and told with its share."""
+    pixels = np.full((300, 1000, 3), 0.2, np.float32)
+    pixels[..., 2] = 0.5
+    cloud, odd = np.zeros((2, 300, 1000), bool)
+    cloud[:75], odd[75, 0] = True, True
+    left_out = {"cloud": cloud, "an odd reason": odd}
+    assert shares(left_out) == {"fitted": "75 %", "cloud": "25 %", "an odd reason": "under 0.1 %"}
+    sheet = np.asarray(PIL.Image.open(io.BytesIO(as_png(mask_figure(pixels, left_out)))).convert("RGB"))
+    assert sheet.shape[1] == 1000
+    below = sheet.shape[0] - 2 * 300 - 2 * 24
+    photo, mask = sheet[24:324], sheet[-below - 300 : -below]
+    assert np.ptp(photo.reshape(-1, 3), axis=0).max() == 0
+    assert photo[0, 0, 2] > photo[0, 0, 0]
+    np.testing.assert_array_equal(mask[76:], photo[76:])
+    red = 255 * (0.5 * photo[0, 0].mean() / 255 + 0.5 * skymask.TINTS[skymask.CLOUD])
+    np.testing.assert_allclose(mask[:75], np.broadcast_to(red, (75, 1000, 3)), atol=1)
+
+
+@pytest.mark.parametrize(("shape", "size"), [((2048, 1024), (1024, 512)), ((30, 20), (600, 400)), ((5, 1), (600, 120))])
+def test_photos_of_any_size_are_shown(shape, size):
+    figure = mask_figure(np.full((*shape, 3), 0.3, np.float32), {})
+    assert figure.get_size_inches()[0] * 110 == pytest.approx(2 * size[1] + 10)
+    assert [np.shape(axes.images[0].get_array())[:2] for axes in figure.axes] == [size, size]
+
+
+def test_figures_of_the_caller_are_written_and_come_first(tmp_path):
+    plate = report.Plate("mask.png", mask_figure(np.full((4, 8, 3), 0.2), {}), "a <sky>")
+    found = toy_sky.result()
+    one = dataclasses.replace(found, observations=found.observations[:1], fitted=found.fitted[:1])
+    paths = report.write(one, tmp_path, plates=[plate])
+    assert tmp_path / "mask.png" in paths
+    assert (tmp_path / "mask.png").read_bytes().startswith(b"\x89PNG")
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert page.index("residuals: median") < page.index("a &lt;sky&gt;") < page.index("<h2>Parameters")
+    assert page.count("<img") == 1 + 1 + 3
+    with pytest.raises(FitError, match="holds results already"):
+        report.check_writable(tmp_path)
+
+
+def test_of_a_scan_its_figure_is_written(tmp_path):
+    """Its pixels are no picture."""
+    found = toy_sky.result()
+    row = fitting.observe(
+        found.observations[0].image[8:9, :6],
+        camera=Scan(np.full(6, 0.5), np.arange(6.0)),
+        altitude=0.1,
+        sun=toy_sky.towards_sun(30),
+        name="scan",
+        pose="free",
+    )
+    report.write(dataclasses.replace(found, observations=[row], fitted=[row.image]), tmp_path)
+    pictures = {path.name for path in tmp_path.iterdir()} - {"fit.json", "atmosphere.toml", "report.html"}
+    assert pictures == {"fitted_scan.exr", "fitted_scan.png", "residual_scan.exr"}
+    assert PIL.Image.open(tmp_path / "fitted_scan.png").size[0] > 800
 
 
 def test_names_are_made_safe():
@@ -160,7 +261,7 @@ def test_one_failure_does_not_take_the_rest_along(tmp_path, monkeypatch):
         raise imageio.ImageError(f"{path}: cannot be written: No space left on device")
 
     monkeypatch.setattr(imageio, "write_png", full)
-    monkeypatch.setattr(report, "page", lambda _: "page")
+    monkeypatch.setattr(report, "page", lambda *_: "page")
     with pytest.raises(OSError, match=r"fitted_sun_30\.png: cannot be written: No space left.*residual_sun_80\.png"):
         report.write(toy_sky.result(), tmp_path)
     present = {path.name for path in tmp_path.iterdir()}

@@ -221,7 +221,11 @@ def test_it_shows_itself_as_a_table():
     assert re.search(r"rayleigh_scale_height +7\.99\d\d +not determined .*10\.4 +8\n", shown)
     assert re.search(r"mie_scattering +680 +0\.00408\d +at its bound +25 % +0\.00519 +0\.003996", shown)
     assert "…" not in shown
-    assert lines[0] == "Converged after 8 iterations, reduced χ² = 1.002"
+    assert re.fullmatch(
+        r"residuals of sun 30: median \|measured / fitted − 1\| 680 nm (0\.\d+) %, 550 nm (0\.\d+) %, 440 nm (0\.\d+) %",
+        lines[1],
+    )
+    assert lines[4] == "Converged after 8 iterations, reduced χ² = 1.002"
     assert "mie_single_scattering_albedo" in shown
     assert "The images do not determine rayleigh_scale_height." in shown
     assert "\x1b" not in shown

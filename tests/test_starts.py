@@ -12,6 +12,7 @@ from fitting.batch import stack
 from fitting.parameters import select
 from fitting.problem import Problem
 from fitting.starts import grid, ranked, separation, thinned
+from fitting.tables import notes
 
 
 def wrong(aerosol, rayleigh_height, mie_height, g):
@@ -113,7 +114,7 @@ def test_two_minima_are_reported(tmp_path):
     assert sorted(minimum.values["mie_g"] for minimum in found.minima) == pytest.approx([-0.5, 0.5], abs=0.01)
     assert found.minima[1].chi2 == pytest.approx(found.minima[0].chi2, rel=1e-4)
     assert found.minima[0].values["mie_g"] == pytest.approx(found.estimate("mie_g").value)
-    (note,) = [note for note in report.notes(found) if "minima" in note]
+    (note,) = [note for note in notes(found) if "minima" in note]
     assert note.startswith("There are 2 minima")
     assert f"mie_g = {found.minima[1].values['mie_g']:.4g}" in note
     assert report.record(found)["minima"][1]["values"]["mie_g"] == found.minima[1].values["mie_g"]

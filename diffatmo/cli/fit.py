@@ -176,6 +176,8 @@ def fit(
     first = join(hosts)
     specs = plan(images, config, options, output, bracketed=bracketed)
     # All that can be wrong is found before the first fit, which is written as soon as it is done.
+    for directory, spec in specs.items():
+        check_masks(spec, directory)
     jobs = {directory: prepare(spec.override(**override)) for directory, spec in specs.items()}
     from fitting import checkpoint, report
 
@@ -223,6 +225,16 @@ def check_begun(directory: Path, *, resume: bool, overwrite: bool) -> bool:
             f"{directory}: the fit here is complete, there is nothing to go on with; --overwrite fits again, -o elsewhere"
         )
     return resume and file.exists()
+
+
+def check_masks(spec: FitSpec, directory: Path) -> None:
+    """Refuse a mask that the picture of the mask in the report would replace."""
+    for image in spec.images:
+        mask = Path(image.options.get("mask", ""))
+        if mask.parent.resolve() == directory.resolve() and (mask.name == "mask.png" or mask.name.startswith("mask_")):
+            raise InputError(
+                f"mask: {mask} bears the name of a file of the report, expected one outside of {directory}"
+            )
 
 
 def check_bracket(images: Sequence[Path], *, each: bool) -> None:
