@@ -11,9 +11,7 @@ import pytest
 import toy_sky
 from rich.console import Console
 
-import fitting
 from diffatmo import atmosphere, color, imageio, scene, skymask
-from diffatmo.scan import Scan
 from fitting import Estimate, FitError, Prior, report
 from fitting.figures import as_png, mask_figure, shares
 from fitting.tables import format_number, fragment
@@ -174,7 +172,8 @@ def test_a_photo_and_its_mask():
     cloud[:75], odd[75, 0] = True, True
     left_out = {"cloud": cloud, "an odd reason": odd}
     assert shares(left_out) == {"fitted": "75 %", "cloud": "25 %", "an odd reason": "under 0.1 %"}
-    sheet = np.asarray(PIL.Image.open(io.BytesIO(as_png(mask_figure(pixels, left_out)))).convert("RGB"))
+    with PIL.Image.open(io.BytesIO(as_png(mask_figure(pixels, left_out)))) as picture:
+        sheet = np.asarray(picture.convert("RGB"))
     assert sheet.shape[1] == 1000
     below = sheet.shape[0] - 2 * 300 - 2 * 24
     photo, mask = sheet[24:324], sheet[-below - 300 : -below]
@@ -185,7 +184,7 @@ def test_a_photo_and_its_mask():
     np.testing.assert_allclose(mask[:75], np.broadcast_to(red, (75, 1000, 3)), atol=1)
 
 
-@pytest.mark.parametrize(("shape", "size"), [((2048, 1024), (1024, 512)), ((30, 20), (600, 400)), ((5, 1), (600, 120))])
+@pytest.mark.parametrize(("shape", "size"), [((1280, 640), (1024, 512)), ((30, 20), (600, 400)), ((5, 1), (600, 120))])
 def test_photos_of_any_size_are_shown(shape, size):
     figure = mask_figure(np.full((*shape, 3), 0.3, np.float32), {})
     assert figure.get_size_inches()[0] * 110 == pytest.approx(2 * size[1] + 10)
@@ -206,21 +205,19 @@ def test_figures_of_the_caller_are_written_and_come_first(tmp_path):
         report.check_writable(tmp_path)
 
 
-def test_of_a_scan_its_figure_is_written(tmp_path):
+def test_of_a_scan_its_figure_is_written(tmp_path, monkeypatch):
     """Its pixels are no picture."""
+    monkeypatch.setattr(report, "page", lambda *_: "page")
     found = toy_sky.result()
-    row = fitting.observe(
-        found.observations[0].image[8:9, :6],
-        camera=Scan(np.full(6, 0.5), np.arange(6.0)),
-        altitude=0.1,
-        sun=toy_sky.towards_sun(30),
-        name="scan",
-        pose="free",
-    )
-    report.write(dataclasses.replace(found, observations=[row], fitted=[row.image]), tmp_path)
+    seen = found.observations[0]
+    grids = ("image", "directions", "shown", "used", "noise", "noise_shot", "noise_floor")
+    row = {name: getattr(seen, name)[8:9] for name in grids}
+    scanned = dataclasses.replace(seen, name="scan", pose="free", **row)
+    report.write(dataclasses.replace(found, observations=[scanned], fitted=[found.fitted[0][8:9]]), tmp_path)
     pictures = {path.name for path in tmp_path.iterdir()} - {"fit.json", "atmosphere.toml", "report.html"}
     assert pictures == {"fitted_scan.exr", "fitted_scan.png", "residual_scan.exr"}
-    assert PIL.Image.open(tmp_path / "fitted_scan.png").size[0] > 800
+    height, width, _ = imageio.read_image(tmp_path / "fitted_scan.png", transfer="srgb").pixels.shape
+    assert width > 2 * height > 800
 
 
 def test_names_are_made_safe():
