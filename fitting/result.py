@@ -28,7 +28,7 @@ _FIGURES: dict[str, Callable[[Findings], Figure]] = {
 class FitResult(Findings):
     """What a fit found: the numbers of :class:`~fitting.findings.Findings`, and ways to look at them, keep them and use them.
 
-    At the end of a notebook's cell it shows itself as a table.
+    At the end of a notebook's cell it shows itself: the numbers that are asked for first, residuals in percent, and the table.
     """
 
     def __repr__(self) -> str:

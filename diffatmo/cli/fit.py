@@ -142,7 +142,8 @@ def fit(
     priors of a clear day, noise of 5 %, 15° around the sun and the lowest 5 or 10° left out, exposure and pose fitted. So
     has a scan, a .npz or .csv of measured spectra.
 
-    Writes fit.json, atmosphere.toml, pictures of images, fits and residuals, and report.html.
+    Writes fit.json, atmosphere.toml, pictures of images, fits and residuals, of a photo mask.png, which shows what of it
+    was fitted, and report.html.
 
     A FOLDER stands for the images in it, each fitted on its own, several at a time: DIR gets a folder for each image, and
     results.csv with a row for each. One that cannot be fitted does not stop the others.
