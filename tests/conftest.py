@@ -23,6 +23,20 @@ PROGRAMS_AT_MOST = 2e9
 """Bytes of memory beyond which compiled programs are dropped: of the thousands that the suite needs, each is kept for ever."""
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _keep_programs(tmp_path_factory):
+    """Programs that were dropped, and those of the commands that tests start, are found again on disk.
+
+    Every worker has a folder of its own, as JAX does not guard its files against other processes.
+    """
+    folder = str(tmp_path_factory.mktemp("programs"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("JAX_COMPILATION_CACHE_DIR", folder)
+        jax.config.update("jax_compilation_cache_dir", folder)
+        yield
+        jax.config.update("jax_compilation_cache_dir", None)
+
+
 @pytest.fixture(autouse=True)
 def _drop_programs():
     """Not after every module: files share programs, and a process needs a gigabyte before it has to let go of them."""
