@@ -55,7 +55,8 @@ class Linearisation(NamedTuple):
     beyond: Float[Array, ""]
     """What the robust loss of these residuals exceeds their weighted squares by."""
     pushes: Float[Array, "image w b k"]
-    """The columns, summed with each smooth field times the light: what errors of the model of such a form do."""
+    """The columns, summed with each smooth field times the light that the correction adds, or all light where there is none:
+    what errors of such a form do."""
     radiance: Predicted
     bad: Int[Array, "image 2"]
     """Used pixels whose radiance or whose derivatives are not finite."""
@@ -108,7 +109,10 @@ def _linearise(x: Coordinates, linear: Linear, problem: Problem) -> Linearisatio
         columns = jnp.concatenate([columns, off[..., None]], axis=-1)
         if problem.fields is not None:
             fields = problem.fields.at(tile["directions"], tile["centre"], tile["coefficient"])
-            pushes = pushes + jnp.einsum("pw,pb,pwk->wbk", columns[..., -3], fields, columns)
+            added = columns[..., -3]
+            if "correction" in tile:
+                added = added * (1 - 1 / tile["correction"])
+            pushes = pushes + jnp.einsum("pw,pb,pwk->wbk", added, fields, columns)
         if problem.loss is not None:
             robust, total = problem.loss(off)
             columns = columns * jnp.sqrt(robust)[:, None, None]

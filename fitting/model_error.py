@@ -21,10 +21,10 @@ LARGEST_CORRECTION = 1.25
 """Factor beyond which a finer model is no correction any more."""
 
 REMAINING = 1 / 5
-"""Error of a finer model over the difference to the coarser one: at most that for ``Moments`` against Monte Carlo in
-atmospheres of aerosol optical depth 0.1 to 0.3 and g up to 0.74, suns from 35° to 93°, once the Monte Carlo's own error is
-taken off (``tests/benchmarks/accuracy.py``). Not so for g = 0.9, where neither resolves the outskirts of the aureole and the
-model's error is understated."""
+"""Error of a finer model over the difference to the coarser one. For ``Moments`` against Monte Carlo, over the smooth part of
+the sky, it is 0.03 to 0.1 in haze of optical depth 0.3 to 0.4, where the difference is 1 to 3 %, and 0.1 to 0.3 in clear air,
+where it is 0.1 %; more with g above 0.8, where neither resolves the outskirts of the aureole, and the model's error is
+understated (``tests/benchmarks/accuracy.py``, ``recovery.py``)."""
 
 
 def correction(x: Coordinates, problem: Problem, radiance: Predicted, finer: Model) -> Predicted:
@@ -63,13 +63,13 @@ def deviation(problem: Problem) -> Float[np.ndarray, "image w"]:
 def covariance(best: Point, problem: Problem) -> Float[np.ndarray, "n n"]:
     """Covariance of the coordinates from what the correction leaves of the model's error.
 
-    The finer model is taken to be off by :data:`REMAINING` of what the coarser one was off: in every image by a smooth random
-    function of direction, half of its variance common to all channels and half of each channel's own. Its amplitude is the
-    RMS of the correction there.
+    The finer model is taken to be off by :data:`REMAINING` of what the coarser one was off there, pixel by pixel, times a
+    random function of variance one that is smooth on the sky: in every image another, half of its variance common to all
+    channels and half of each channel's own. Errors are so largest where the correction is, as near the horizon in haze, where the
+    scale heights are read.
     """
     pushed = pushes(best.y, best.linearisation, problem)
-    amplitude = REMAINING * deviation(problem)
-    pushed = pushed * amplitude[:, :, None, None] / math.sqrt(2 * pushed.shape[2])
+    pushed = pushed * (REMAINING / math.sqrt(2 * pushed.shape[2]))
     every = np.concatenate([pushed.reshape(-1, best.y.size), pushed.sum(axis=1).reshape(-1, best.y.size)])
     # δy = (RᵀR)⁻¹ Jᵀ δr: through the pseudo-inverse, as some combinations may not be determined at all.
     length = np.linalg.norm(best.triangle[:, :-1], axis=0)

@@ -129,17 +129,20 @@ def test_smooth_fields_are_orthogonal_with_mean_square_one():
     assert fields.coefficient.shape[-1] == 16
 
 
-def test_a_push_is_the_jacobian_transposed(x64):
-    """Against a relative error put into the radiance by hand."""
+@pytest.mark.parametrize("corrected", [False, True])
+def test_a_push_is_the_jacobian_transposed(x64, corrected):
+    """Against an error put into the radiance by hand: relative, or as large as what a correction has added there."""
     ours, y = problem(toy_sky.Toy(), toy_sky.FREE, exposure=("free", "fixed"))
-    ours = dataclasses.replace(ours, fields=Fields.of(ours.batch, 1))
+    correction = jnp.asarray(np.random.default_rng(3).uniform(0.9, 1.1, ours.weight.shape))
+    ours = dataclasses.replace(ours, fields=Fields.of(ours.batch, 1), correction=correction if corrected else None)
     got = pushes(y, linearise(*ours.split(y), ours), ours)
     coordinates, moved = ours.parts(ours.split(y)[0])
     atmosphere = ours.parameters.atmosphere(coordinates)
-    expected = light(y, predict(ours.sky, atmosphere, ours.batch.views(moved)), ours)
+    expected = light(y, predict(ours.sky, atmosphere, ours.batch.views(moved)), ours) * (correction if corrected else 1)
     image, channel, field = 1, 2, 3
     forms = ours.fields.at(ours.batch.directions[image], ours.fields.centre[image], ours.fields.coefficient[image])
-    wrong = expected.at[image, :, channel].multiply(1 + forms[:, field])
+    part = 1 - 1 / correction[image, :, channel] if corrected else 1
+    wrong = expected.at[image, :, channel].multiply(1 + part * forms[:, field])
     moved = np.asarray((wrong - expected) * ours.weight).reshape(-1)
     np.testing.assert_allclose(
         got[image, channel, field], plain_residuals.jacobian(y, ours).T @ moved, rtol=1e-8, atol=1e-6
