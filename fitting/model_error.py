@@ -65,8 +65,8 @@ def covariance(best: Point, problem: Problem) -> Float[np.ndarray, "n n"]:
 
     The finer model is taken to be off by :data:`REMAINING` of what the coarser one was off there, pixel by pixel, times a
     random function of variance one that is smooth on the sky: in every image another, half of its variance common to all
-    channels and half of each channel's own. Errors are so largest where the correction is, as near the horizon in haze, where the
-    scale heights are read.
+    channels and half of each channel's own. Errors are so largest where the correction is, as near the horizon in haze, where
+    the scale heights are read.
     """
     pushed = pushes(best.y, best.linearisation, problem)
     pushed = pushed * (REMAINING / math.sqrt(2 * pushed.shape[2]))
