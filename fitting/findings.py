@@ -162,6 +162,8 @@ class Findings:
     setup: Setup | None = None
     model: Model | None = None
     refine: bool = True
+    moved: float = 0.0
+    """By how many of its standard errors a finer model has moved the number that it moved most."""
 
     @property
     def reduced_chi2(self) -> float:

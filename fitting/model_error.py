@@ -60,6 +60,22 @@ def deviation(problem: Problem) -> Float[np.ndarray, "image w"]:
     return np.sqrt((off**2).sum(axis=1) / np.maximum(used.sum(axis=1), 1)[:, None])
 
 
+def moved(before: Point, best: Point, error: Float[np.ndarray, "n n"], size: int) -> float:
+    """The largest way of the first ``size`` coordinates from ``before`` to ``best``, in standard errors, ``error`` included."""
+    inverse = _inverse(best)
+    bars = np.sqrt(np.diag(inverse @ inverse.T + error))[:size]
+    way = np.abs(np.asarray(best.y, dtype=np.float64) - np.asarray(before.y, dtype=np.float64))[:size]
+    return float(np.max(way / np.where(bars > 0, bars, np.inf), initial=0.0))
+
+
+def _inverse(best: Point) -> Float[np.ndarray, "n k"]:
+    """R⁻¹: the pseudo-inverse, as some combinations may not be determined at all."""
+    length = np.linalg.norm(best.triangle[:, :-1], axis=0)
+    scale = np.where(length > 0, length, 1)
+    inverse: Float[np.ndarray, "n k"] = np.linalg.pinv(best.triangle[:, :-1] / scale, rcond=RANK_TOLERANCE)
+    return inverse / scale[:, None]
+
+
 def covariance(best: Point, problem: Problem) -> Float[np.ndarray, "n n"]:
     """Covariance of the coordinates from what the correction leaves of the model's error.
 
@@ -71,9 +87,7 @@ def covariance(best: Point, problem: Problem) -> Float[np.ndarray, "n n"]:
     pushed = pushes(best.y, best.linearisation, problem)
     pushed = pushed * (REMAINING / math.sqrt(2 * pushed.shape[2]))
     every = np.concatenate([pushed.reshape(-1, best.y.size), pushed.sum(axis=1).reshape(-1, best.y.size)])
-    # δy = (RᵀR)⁻¹ Jᵀ δr: through the pseudo-inverse, as some combinations may not be determined at all.
-    length = np.linalg.norm(best.triangle[:, :-1], axis=0)
-    scale = np.where(length > 0, length, 1)
-    inverse = np.linalg.pinv(best.triangle[:, :-1] / scale, rcond=RANK_TOLERANCE) / scale[:, None]
+    # δy = (RᵀR)⁻¹ Jᵀ δr.
+    inverse = _inverse(best)
     shifts = every @ inverse @ inverse.T
     return shifts.T @ shifts

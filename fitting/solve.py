@@ -125,6 +125,8 @@ class Solution(NamedTuple):
     """Pixels of each image to which a robust loss gives less than half their weight."""
     minima: list[tuple[Coordinates, float]]
     """Coordinates and χ² of the minima, the best first, if there are several; before any correction by a finer model."""
+    moved: float
+    """By how many of its standard errors a finer model has moved the number that it moved most."""
 
     @property
     def chi2(self) -> float:
@@ -466,7 +468,7 @@ def solve(
         if not found.interrupted:
             found = _final_pass(run, found)
     minima = [(point.y, point.chi2) for point in (found.best, *found.rivals)] if found.rivals else []
-    error = np.zeros((size, size))
+    error, alone = np.zeros((size, size)), found.best
     if finer is not None and found.best.converged:
         for thread in compiling[1:]:
             thread.join()
@@ -493,6 +495,7 @@ def solve(
         converged=best.converged,
         message=best.message,
         minima=minima,
+        moved=model_error.moved(alone, best, error, parameters.size),
         timings={"compile_s": total - evaluations, "solve_s": evaluations, "total_s": total},
         **_shares(best, problem),
     )

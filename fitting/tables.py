@@ -30,6 +30,9 @@ SURPRISING, UNLIKELY = 0.01, 2.0
 """Probability below which what was found contradicts what was known beforehand, and standard errors from which a number is told
 as one that does."""
 
+MOVED = 6.0
+"""Standard errors by which a finer model may move a number: beyond, in dense haze, it is off by half of the way itself."""
+
 POOR = 0.1
 """Relative residuals of a photo, as a standard deviation, beyond those of clear skies."""
 
@@ -264,6 +267,12 @@ def doubts(result: Findings) -> list[str]:
         found.append(
             f"The residuals are {result.error_scale:.1f} times as large as the stated noise, and so are the standard "
             "errors. If the noise is right, the model does not describe the images as precisely as it should."
+        )
+    if result.moved > MOVED:
+        found.append(
+            f"The model's finer self has moved a number by {result.moved:.0f} of its standard errors, and may be wrong by more "
+            "than these say. Images with the sun elsewhere tell more; without the lowest degrees of the sky "
+            "(horizon_exclusion_deg) less depends on the model."
         )
     for observation, residual in zip(result.observations, result.residuals, strict=True):
         # Of a photo the stated noise is that of few independent numbers, and hides what is wrong everywhere.

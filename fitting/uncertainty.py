@@ -175,6 +175,7 @@ def summarise(
         priors=[*priors, *(Prior(*known) for known in assumed(observations))],
         outliers=solution.outliers,
         minima=_minima(solution),
+        moved=solution.moved,
         setup=Setup(parameters.init, list(free), dict(tie or {}), loss, np.asarray(solution.y)),
         undetermined=[e.name for e in [*estimates, *nuisances] if e.standard_error is None],
         model=model,

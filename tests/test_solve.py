@@ -1,5 +1,7 @@
 """The search: it finds the optimum from far off, respects bounds, and when it cannot converge it says so."""
 
+import dataclasses
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -8,7 +10,7 @@ import toy_sky
 from toy_sky import FREE, Toy
 
 from diffatmo.models.base import Ray
-from fitting import FitError, fit
+from fitting import FitError, fit, tables
 from fitting import solve as solving
 from fitting.search import Step, distance, steps_left
 from fitting.solve import solve
@@ -279,6 +281,11 @@ def test_model_error_covers_a_fifth_of_the_correction():
     blind = fit(images, init=toy_sky.start(), free=FREE, model=LessCrude()).with_truth(toy_sky.truth())
     assert max(abs(e.pull) for e in blind.parameters) > 5
     assert max(abs(e.pull) for e in found.parameters) < 3
+    # A correction of which a fifth is in the error bars has moved a number by five of them or so.
+    assert 2 < found.moved < 10
+    assert blind.moved == 0
+    assert any("finer self has moved" in doubt for doubt in tables.doubts(dataclasses.replace(found, moved=7.2)))
+    assert not any("finer self" in doubt for doubt in tables.doubts(dataclasses.replace(found, moved=5.0)))
 
 
 def test_the_finer_model_is_asked_again_where_its_correction_moves_the_optimum(monkeypatch):
