@@ -112,27 +112,32 @@ def check_jacobian():
 
     ``check_jacobian(function, points, *rest)``: the derivative of ``function(x, *rest)`` in the vector ``x`` at each of
     ``points``, relative to the largest entry of each column. ``rest`` are arguments, because what a compiled function
-    closes over is folded into constants, which can take minutes.
+    closes over is folded into constants, which can take minutes. Returns the forward derivative at each point.
     """
 
     def check(function, points, *rest, step=1e-5, tolerance=1e-5):
-        def flat(x, *rest):
-            return jnp.ravel(function(x, *rest))
-
-        # Run once for each point: what takes long is compilation.
-        @partial(eqx.filter_jit, compiler_options=COMPILE_FAST)
-        def jacobians(x, *rest):
-            shifts = step * jnp.eye(x.size)
-            around = jax.lax.map(lambda shift: flat(x + shift, *rest), jnp.concatenate([shifts, -shifts]))
-            numeric = (around[: x.size] - around[x.size :]).T / (2 * step)
-            return numeric, jax.jacfwd(flat)(x, *rest), jax.jacrev(flat)(x, *rest)
-
+        slopes = []
         for point in points:
-            numeric, forward, reverse = map(np.asarray, jacobians(jnp.asarray(point), *rest))
+            numeric, forward, reverse = map(np.asarray, _jacobians(function, jnp.asarray(point), step, *rest))
             scale = np.abs(numeric).max(0)
             # A column may vanish by symmetry; then it is compared with the others.
             scale = np.maximum(scale, 1e-3 * scale.max())
             np.testing.assert_allclose(forward / scale, numeric / scale, atol=tolerance)
             np.testing.assert_allclose(reverse / scale, numeric / scale, atol=tolerance)
+            slopes.append(forward)
+        return slopes
 
     return check
+
+
+@partial(eqx.filter_jit, compiler_options=COMPILE_FAST)
+def _jacobians(function, x, step, *rest):
+    """By central differences, forward and reverse; compiled once for a function and the shapes of its arguments."""
+
+    def flat(x):
+        return jnp.ravel(function(x, *rest))
+
+    shifts = step * jnp.eye(x.size)
+    around = jax.lax.map(lambda shift: flat(x + shift), jnp.concatenate([shifts, -shifts]))
+    numeric = (around[: x.size] - around[x.size :]).T / (2 * step)
+    return numeric, jax.jacfwd(flat)(x), jax.jacrev(flat)(x)

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from few_programs import radiance
 
 from diffatmo import atmosphere, imageio, models, scene, sun
 from diffatmo.camera import Equirectangular, Fisheye, Pinhole
@@ -86,10 +87,11 @@ DIRECTIONS = ["altitude_km", "sun_zenith_deg", "view_zenith_deg", "view_azimuth_
 def direct(model, air, row):
     """Radiance and transmittance of one row, asked of the library."""
     zenith, view, azimuth = (math.radians(float(row[name])) for name in DIRECTIONS[1:])
-    ray = model.sky(air).radiance(
-        altitude=jnp.asarray(float(row["altitude_km"])),
-        view=sun.direction(zenith=view, azimuth=azimuth),
-        sun=sun.direction(zenith=zenith, azimuth=0.0),
+    ray = radiance(
+        model.sky(air),
+        float(row["altitude_km"]),
+        sun.direction(zenith=view, azimuth=azimuth),
+        sun.direction(zenith=zenith, azimuth=0.0),
     )
     return np.concatenate([ray.radiance, ray.transmittance])
 

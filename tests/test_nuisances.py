@@ -1,6 +1,7 @@
 """What images depend on besides the air: it is recovered, it does not bias the air, and the linear part costs no step."""
 
 import dataclasses
+import functools
 import math
 
 import equinox as eqx
@@ -10,6 +11,7 @@ import numpy as np
 import plain_residuals
 import pytest
 import toy_sky
+from few_programs import COMPILE_FAST
 from plain_residuals import residuals
 from scipy.optimize import least_squares
 from toy_sky import Toy
@@ -89,6 +91,13 @@ ALL_FREE = {
 }
 
 
+@functools.cache
+def recovered():
+    """The images, and the fit of all that is free."""
+    images = with_free(skewed(), **ALL_FREE, exposure=("fixed", "fixed", "free"))
+    return images, fitting.fit(images, init=start(), free=FREE, tie=TIE, model=Toy())
+
+
 def start():
     return toy_sky.change(toy_sky.truth(), mie_scattering=6e-3, mie_g=0.7, mie_scale_height=1.6)
 
@@ -97,8 +106,7 @@ def start():
 
 
 def test_offsets_and_pedestals_are_recovered_and_do_not_bias_the_air():
-    images = skewed()
-    found = fitting.fit(with_free(images, **ALL_FREE), init=start(), free=FREE, tie=TIE, model=Toy())
+    images, found = recovered()
     assert found.converged
     assert found.reduced_chi2 == pytest.approx(1, abs=0.05)
     truth = {
@@ -110,7 +118,7 @@ def test_offsets_and_pedestals_are_recovered_and_do_not_bias_the_air():
         truth |= {
             f"pose_{group}_{axis}_deg": sign * v / DEG for axis, v in zip(("east", "north", "up"), TURN, strict=True)
         }
-    truth |= {"focal_lens": 1.02, "focal_c": 0.98}
+    truth |= {"focal_lens": 1.02, "focal_c": 0.98, "exposure_c": 1.0}
     for image in images:
         truth[f"pedestal_{image.name}"] = 0.01 * np.median(image.image) / 1.01
     assert {e.name for e in found.nuisances} == set(truth)
@@ -119,9 +127,38 @@ def test_offsets_and_pedestals_are_recovered_and_do_not_bias_the_air():
         assert abs(estimate.value - truth[estimate.name]) < 4 * estimate.standard_error, estimate
         assert estimate.unit == ("deg" if kind in ("sun", "pose") else "")
         # What is known beforehand is 0.5°, 2° and 5 %; a pedestal is 2e-4.
-        assert estimate.standard_error < {"sun": 0.5, "pose": 0.6, "focal": 0.002, "pedestal": 1e-5}[kind]
+        most = {"sun": 0.5, "pose": 0.6, "focal": 0.002, "pedestal": 1e-5, "exposure": 0.1}
+        assert estimate.standard_error < most[kind]
     for estimate in found.with_truth(toy_sky.truth()).parameters:
         assert abs(estimate.pull) < 4, estimate
+
+
+def test_kept_predicted_and_planned(tmp_path):
+    images, found = recovered()
+    found.save(tmp_path / "fit.npz")
+    back = fitting.FitResult.load(tmp_path / "fit.npz")
+    assert back.nuisances == found.nuisances
+    assert [o.pose for o in back.observations] == ["rig", "rig", "free"]
+    record = fitting.report.record(found)
+    assert record["nuisances"]["pose_rig_up_deg"]["unit"] == "deg"
+    assert record["images"][2]["focal"] == "free"
+    assert fitting.report.scene_of(found, images[0]) is None
+    assert "pose_rig_up_deg" in repr(found)
+
+    scene = fitting.prediction.Scene(toy_sky.truth(), toy_sky.CAMERA, 0.1, toy_sky.towards_sun(45.0))
+    assert np.isfinite(found.predict(scene, exposure="exposure_c").standard_error).all()
+    with pytest.raises(FitError, match="'pose_rig_up_deg' is not a factor"):
+        found.predict(scene, exposure="pose_rig_up_deg")
+
+    parameters = select(found.atmosphere, FREE, TIE)
+    taken = fitting.planning.of_observations(images, parameters, Toy())
+    names = [estimate.name for estimate in found.nuisances]
+    assert list(taken.nuisances) == names
+    # What a plan promises of images that exist is what their fit found.
+    errors = np.sqrt(np.diag(np.linalg.inv(taken.factor.T @ taken.factor)))
+    focal = names.index("focal_c")
+    wanted = found.nuisances[focal]
+    assert errors[focal] * 0.05 * wanted.value == pytest.approx(wanted.standard_error / found.error_scale, rel=0.05)
 
 
 def test_fixed_they_spoil_the_fit():
@@ -170,18 +207,24 @@ def test_jacobian_against_differences(x64, model, zenith, parts, lenses):
     images = with_free(images, focal=("free", "free", "fixed"), **choices)
     ours = problem(images, model)
     assert ours.batch.directions.shape[2] == parts
-    fast = {"compiler_options": {"xla_backend_optimization_level": 0}}
-    plain = eqx.filter_jit(residuals, **fast)
+
+    # Of fourth order, as its steps have to be long: angles near a lens's axis are rounded to 1e-11.
+    @functools.partial(eqx.filter_jit, compiler_options=COMPILE_FAST)
+    def differences(y, ours):
+        steps = 1e-5 * jnp.eye(y.size)
+        there = [factor * steps for factor in (1, -1, 2, -2)]
+        one, back, two, far_back = jax.lax.map(
+            lambda step: residuals(y + step, ours), jnp.stack(there).reshape(-1, y.size)
+        ).reshape(4, y.size, -1)
+        return (8 * (one - back) - (two - far_back)).T / 12e-5
+
     rest = jnp.zeros(ours.batch.nuisances.size)
     # With nothing moved, and with everything.
     for y in (
         jnp.concatenate([ours.start[:1], rest + n * 0.1 * jnp.sin(jnp.arange(1.0, rest.size + 1))]) for n in (0, 1)
     ):
         slope = plain_residuals.jacobian(y, ours)
-        # Of fourth order, as its steps have to be long: angles near a lens's axis are rounded to 1e-11.
-        odd = lambda step: np.asarray(plain(y + step, ours) - plain(y - step, ours))  # noqa: B023
-        steps = 1e-5 * jnp.eye(y.size)
-        numeric = np.stack([8 * odd(step) - odd(2 * step) for step in steps], axis=-1) / 12e-5
+        numeric = np.asarray(differences(y, ours))
         scale = np.abs(numeric).max(0)
         # Unmoved, a turn about the zenith changes nothing if the sun is there.
         assert np.all(scale > 0) or (zenith == 0 and not y[1:].any())
@@ -519,35 +562,6 @@ def test_what_the_images_do_not_tell_comes_from_what_is_known():
 
 
 # Elsewhere ----------------------------------------------------------------------------------------------------------
-
-
-def test_kept_predicted_and_planned(tmp_path):
-    images = with_free(skewed(), **ALL_FREE, exposure="free")
-    found = fitting.fit(images, init=start(), free=FREE, tie=TIE, model=Toy())
-    found.save(tmp_path / "fit.npz")
-    back = fitting.FitResult.load(tmp_path / "fit.npz")
-    assert back.nuisances == found.nuisances
-    assert [o.pose for o in back.observations] == ["rig", "rig", "free"]
-    record = fitting.report.record(found)
-    assert record["nuisances"]["pose_rig_up_deg"]["unit"] == "deg"
-    assert record["images"][2]["focal"] == "free"
-    assert fitting.report.scene_of(found, images[0]) is None
-    assert "pose_rig_up_deg" in repr(found)
-
-    scene = fitting.prediction.Scene(toy_sky.truth(), toy_sky.CAMERA, 0.1, toy_sky.towards_sun(45.0))
-    assert np.isfinite(found.predict(scene, exposure="exposure_a").standard_error).all()
-    with pytest.raises(FitError, match="'pose_rig_up_deg' is not a factor"):
-        found.predict(scene, exposure="pose_rig_up_deg")
-
-    parameters = select(found.atmosphere, FREE, TIE)
-    taken = fitting.planning.of_observations(images, parameters, Toy())
-    names = [estimate.name for estimate in found.nuisances]
-    assert list(taken.nuisances) == names
-    # What a plan promises of images that exist is what their fit found.
-    errors = np.sqrt(np.diag(np.linalg.inv(taken.factor.T @ taken.factor)))
-    focal = names.index("focal_c")
-    wanted = found.nuisances[focal]
-    assert errors[focal] * 0.05 * wanted.value == pytest.approx(wanted.standard_error / found.error_scale, rel=0.05)
 
 
 def test_a_plan_knows_what_the_images_leave_in_doubt():
