@@ -98,6 +98,7 @@ def merge(
     shortest = pictures[int(np.argmin(exposures))]
     brightest = white / min(exposures)
     clipped = np.isnan(light) & ~(shortest < white / 2)
+    # Pixels without light are left out by the fit, whatever their noise, which has to be a number.
     image = images[0]._replace(
         pixels=np.where(clipped, np.float32(brightest), light), noise=np.nan_to_num(noise), saturation=float(brightest)
     )

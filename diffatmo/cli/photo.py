@@ -423,6 +423,7 @@ def glow(pixels: "np.ndarray", camera: "Camera") -> "np.ndarray | None":
     import numpy as np
 
     directions = np.asarray(camera.directions()).reshape(-1, 3)
+    # What is not known is no glow; what is infinite is as bright as anything else.
     light = np.nan_to_num(pixels.mean(axis=-1), posinf=0.0, neginf=0.0).ravel()
     light = np.where(np.isposinf(pixels).any(axis=-1).ravel(), light.max(), light)
     above = directions[:, 2] > 0

@@ -182,10 +182,11 @@ def main() -> None:
     for name in JUDGED:
         pulls = np.abs([one["pulls"].get(name, np.nan) for one in found])
         share = np.median([one["shares"].get(name) or 0 for one in found])
-        row = [f"{np.nanmean(pulls < limit):.0%}" for limit in (1, 2)]
+        # A number without an error bar is not within any.
+        row = [f"{np.mean(pulls < limit):.0%}" for limit in (1, 2)]
         table.add_row(name, *row, f"{np.nanmax(pulls):.1f}", f"{share:.0%}")
     table.add_row(
-        "all", *(f"{np.nanmean(np.abs(every) < limit):.0%}" for limit in (1, 2)), f"{np.nanmax(np.abs(every)):.1f}", ""
+        "all", *(f"{np.mean(np.abs(every) < limit):.0%}" for limit in (1, 2)), f"{np.nanmax(np.abs(every)):.1f}", ""
     )
     Console(width=110).print(table)
     whole = np.mean([max(map(abs, one["pulls"].values())) < 2 for one in found])
