@@ -18,8 +18,8 @@ ROOT = Path(__file__).parent.parent
 # __init__.py.
 LEVELS = [
     ["diffatmo._types", "diffatmo.constants", "diffatmo.compiling", "diffatmo.folders"],
-    ["diffatmo.numerics", "diffatmo.saturation"],
-    ["diffatmo.ephemeris"],
+    ["diffatmo.numerics", "diffatmo.saturation", "diffatmo.features"],
+    ["diffatmo.ephemeris", "diffatmo.horizon"],
     [
         f"diffatmo.{name}"
         for name in ("geometry", "phase", "table", "spectrum", "color", "codecs", "camera", "sun", "exif")
@@ -73,8 +73,9 @@ LEVELS = [
     ["diffatmo.cli.photo", "diffatmo.cli.bracket"],
     ["diffatmo.cli.scans"],
     ["diffatmo.cli.images", "diffatmo.cli.origin"],
-    ["diffatmo.cli.many"],
-    ["diffatmo.cli.radiance", "diffatmo.cli.render", "diffatmo.cli.fit"],
+    ["diffatmo.cli.many", "diffatmo.cli.jobs"],
+    ["diffatmo.cli.radiance", "diffatmo.cli.render", "diffatmo.cli.running"],
+    ["diffatmo.cli.fit"],
     ["diffatmo.cli.compare", "diffatmo.cli.export", "diffatmo.cli.plan"],
     ["diffatmo.cli.imports"],
     ["diffatmo.cli.main"],

@@ -21,7 +21,7 @@ from diffatmo.camera import Equirectangular, Fisheye, Pinhole
 from diffatmo.cli import cache, images, shipped
 from diffatmo.cli import radiance as radiance_command
 from diffatmo.cli.common import InputError
-from diffatmo.cli.fit import make_priors
+from diffatmo.cli.jobs import make_priors
 from diffatmo.cli.main import main
 from diffatmo.cli.render import picture_size
 from diffatmo.cli.scenefile import FREE, read_scene

@@ -14,12 +14,14 @@ from diffatmo import bands, color, imageio, sun
 from diffatmo.camera import Equirectangular, Pinhole
 from diffatmo.cli import photo
 from diffatmo.cli.common import InputError
-from diffatmo.cli.fit import check_masks, plates, prepare
+from diffatmo.cli.fit import check_masks
 from diffatmo.cli.images import find_camera
+from diffatmo.cli.jobs import prepare
+from diffatmo.cli.running import plates
 from diffatmo.cli.scenefile import FitSpec, ImageSpec, check_image_options
 from diffatmo.exif import Exif
+from diffatmo.horizon import Horizon
 from diffatmo.imageio import Image
-from diffatmo.skymask import Horizon
 
 DEG = math.pi / 180
 HEIGHT, WIDTH = 60, 80
@@ -314,7 +316,7 @@ def camera_of(made):
 @pytest.mark.parametrize("row", [10.0, 45.0])
 def test_the_horizon_is_level(monkeypatch, row, slope):
     """A line anywhere, however the camera was tilted: all of it looks along the ground."""
-    monkeypatch.setattr("diffatmo.skymask.find_horizon", lambda _: Horizon(row, slope, 1.0))
+    monkeypatch.setattr("diffatmo.horizon.find_horizon", lambda _: Horizon(row, slope, 1.0))
     made = photo.complete(image(), {}, True)
     x = np.linspace(0, WIDTH - 1, 7)
     elevation = np.arcsin(np.asarray(camera_of(made).directions_at(x, row + slope * (x - (WIDTH - 1) / 2)))[..., 2])

@@ -5,7 +5,7 @@ import pytest
 
 from diffatmo import spectrum
 from diffatmo.cli.common import InputError
-from diffatmo.cli.fit import prepare
+from diffatmo.cli.jobs import prepare
 from diffatmo.cli.scenefile import FitSpec, ImageSpec
 
 WAVELENGTHS = np.arange(400.0, 701.0, 50.0)

@@ -9,7 +9,7 @@ import pytest
 from few_programs import COMPILE_FAST
 
 import diffatmo
-from diffatmo import codecs, imageio, render, saturation, skymask, sun
+from diffatmo import codecs, features, horizon, imageio, render, saturation, skymask, sun
 from diffatmo.camera import Equirectangular
 from diffatmo.models import Hillaire
 
@@ -172,13 +172,13 @@ def test_a_picture_of_nothing_has_no_sky(name):
         shown = skymask.picture(pixels, mask)
         assert shown.shape == pixels.shape
         assert ((shown >= 0) & (shown <= 1)).all()
-    assert skymask.find_horizon(pixels) is None
+    assert horizon.find_horizon(pixels) is None
 
 
 def test_wrong_shapes_are_refused():
-    with pytest.raises(skymask.MaskError, match=r"pixels of shape \(3, 4\), expected \(height, width, 3\)"):
+    with pytest.raises(features.MaskError, match=r"pixels of shape \(3, 4\), expected \(height, width, 3\)"):
         skymask.find_sky(np.ones((3, 4)))
-    with pytest.raises(skymask.MaskError, match="elevation of shape"):
+    with pytest.raises(features.MaskError, match="elevation of shape"):
         skymask.find_sky(np.ones((3, 4, 3)), elevation=np.ones((4, 3)))
 
 
@@ -195,10 +195,10 @@ def seascape(height, width, row, slope):
 @pytest.mark.parametrize(("row", "slope", "scales"), [(75.3, 0.0, (1,)), (100.0, 0.1, (1, 3)), (60.0, -0.2, (1,))])
 def test_horizon_of_the_sea(monkeypatch, row, slope, scales):
     """To a pixel, and with it the mask; a picture larger than the working size has the same horizon."""
-    monkeypatch.setattr(skymask, "WORKING_SIZE", 256)
+    monkeypatch.setattr(features, "WORKING_SIZE", 256)
     pixels = seascape(150, 200, row, slope)
     for scale in scales:
-        found = skymask.find_horizon(pixels.repeat(scale, axis=0).repeat(scale, axis=1))
+        found = horizon.find_horizon(pixels.repeat(scale, axis=0).repeat(scale, axis=1))
         assert found.row == pytest.approx((row + 0.5) * scale - 0.5, abs=scale)
         assert found.slope == pytest.approx(slope, abs=0.002)
         assert found.confidence > 0.95
@@ -215,10 +215,10 @@ def test_no_horizon_where_there_is_none(skies):
         top = int(rng.integers(60, 220))
         street[top:, column : column + 40] = rng.uniform(0.05, 0.4, 3)
         street[top + 5 :: 12, column + 4 : column + 36 : 8] = 0.02
-    assert skymask.find_horizon(street) is None
-    assert skymask.find_horizon(seascape(150, 200, 1e4, 0.0)) is None
+    assert horizon.find_horizon(street) is None
+    assert horizon.find_horizon(seascape(150, 200, 1e4, 0.0)) is None
     for name in ("haze", "twilight"):
-        assert skymask.find_horizon(skies[name][0][:84]) is None
+        assert horizon.find_horizon(skies[name][0][:84]) is None
 
 
 def test_plateaus_and_peaks():

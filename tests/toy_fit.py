@@ -4,7 +4,7 @@ import jax
 from test_cli import Toy
 
 from diffatmo import models
-from diffatmo.cli import fit
+from diffatmo.cli import running
 
 COMPILED: list[str] = []
 jax.monitoring.register_event_duration_secs_listener(
@@ -19,4 +19,4 @@ def run_quietly(job, directory, overwrite):
     (directory / "compilations").write_text(str(len(COMPILED)))
 
 
-ORIGINAL = fit.run_quietly
+ORIGINAL = running.run_quietly

@@ -376,7 +376,7 @@ def _sun_at(said: Mapping[str, Any], exif: "Exif") -> str:
 
 
 def _take_pose(take: Any, said: dict[str, Any], exif: "Exif", pixels: "np.ndarray") -> None:
-    from diffatmo.skymask import find_horizon
+    from diffatmo.horizon import find_horizon
 
     if "yaw_deg" not in said:
         if exif.compass_deg is None:

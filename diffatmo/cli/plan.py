@@ -28,8 +28,9 @@ import click
 
 from diffatmo import folders
 from diffatmo.cli.common import PLAIN_WIDTH, InputError, overwrite_option, read_atmosphere
-from diffatmo.cli.fit import Job, fitting_model, prepare
+from diffatmo.cli.jobs import Job, prepare
 from diffatmo.cli.keys import Number, read
+from diffatmo.cli.running import fitting_model
 from diffatmo.cli.scenefile import IMAGE_KEYS, MODELS, read_scene
 
 if TYPE_CHECKING:

@@ -25,7 +25,7 @@ from diffatmo import bands, color, sun
 from diffatmo.atmosphere import Atmosphere
 from diffatmo.camera import Camera, Equirectangular, Fisheye, Pinhole
 from diffatmo.cli import images, photo
-from diffatmo.cli.fit import fitting_model
+from diffatmo.cli.running import fitting_model
 from diffatmo.cli.scenefile import ImageSpec
 from diffatmo.compiling import outermost
 from diffatmo.exif import Exif

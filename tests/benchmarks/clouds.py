@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.table import Table
 
 import fitting
-from diffatmo.cli.fit import prepare
+from diffatmo.cli.jobs import prepare
 from diffatmo.cli.scenefile import read_scene
 
 SKIES = Path(__file__).parents[2] / "data_synthetic"

@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 
 import fitting
-from diffatmo.cli.fit import fitting_model, prepare
+from diffatmo.cli.jobs import prepare
+from diffatmo.cli.running import fitting_model
 from diffatmo.cli.scenefile import FitSpec, ImageSpec
 
 
