@@ -4,6 +4,7 @@ The rule: guard the input of ``sqrt``, ``log``, ``arccos`` and ``/``, never thei
 has a NaN derivative at ``x <= 0``, because the untaken branch is differentiated as well and 0 * inf is NaN.
 """
 
+import math
 from collections.abc import Callable
 from functools import wraps
 from typing import Any, ParamSpec, TypeVar
@@ -39,8 +40,9 @@ def whole_products(function: Callable[P, T]) -> Callable[P, T]:
 
 def safe_sqrt(x: Float[Array, "..."]) -> Float[Array, "..."]:
     """sqrt(x) for x > 0 and 0 otherwise; the derivative is 0 where x <= 0."""
-    positive = x > 0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1)), 0)
+    x = jnp.asarray(x)
+    positive, one, zero = x > 0, jax.lax.full_like(x, 1), jax.lax.full_like(x, 0)
+    return jax.lax.select(positive, jax.lax.sqrt(jax.lax.select(positive, x, one)), zero)
 
 
 def safe_divide(
@@ -84,6 +86,10 @@ _ERFCX = (
     -1.26551223, 1.00002368, 0.37409196, 0.09678418, -0.18628806,
     0.27886807, -1.13520398, 1.48851587, -0.82215223, 0.17087277,
 )  # fmt: skip
+
+
+ERFCX_OF_ZERO = math.exp(sum(_ERFCX))
+"""What :func:`scaled_erfcx` is at 0: 1 but for its error."""
 
 
 def scaled_erfcx(x: Float[Array, "..."], exponent: Float[Array, "..."]) -> Float[Array, "..."]:

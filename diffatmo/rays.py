@@ -75,8 +75,8 @@ def _piece(
     climb = -stretch * jnp.log(shrink)
     altitude = lower + climb
     v_here = safe_sqrt(v * v + climb)
-    root = safe_sqrt(altitude + perigee + 2 * radius)
-    slope = 2 * k * bounded_divide(v + k * s, shrink * v_here, 1.0) * safe_divide(radius + altitude, root)
+    root = jnp.sqrt(altitude + perigee + 2 * radius)
+    slope = 2 * k * bounded_divide(v + k * s, shrink * v_here, 1.0) * ((radius + altitude) / root)
     return altitude, v_here * root, slope
 
 
@@ -121,7 +121,7 @@ def trace(
     r_mu = (radius + altitude) * mu
     limb = (mu < 0) & ~ground
     # |v| at the lowest point: where the ray starts, without the square root that has no derivative at the horizontal.
-    v_start = jnp.abs(mu) * safe_sqrt((radius + altitude) / (1 + geometry.sine(mu)))
+    v_start = jnp.abs(mu) * jnp.sqrt((radius + altitude) / (1 + geometry.sine(mu)))
     bottom = jnp.where(limb, perigee, jnp.where(ground, 0.0, altitude))
     v_bottom = jnp.where(limb, 0.0, jnp.where(ground, safe_sqrt(jnp.where(ground, -perigee, 0)), v_start))
     heights = [

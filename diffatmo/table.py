@@ -10,8 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from diffatmo.numerics import safe_sqrt
-
 
 def stretch(unit: Float[Array, "..."], linear: float) -> Float[Array, "..."]:
     """[0, 1] -> [0, 1], quadratic with a linear part: ``a u + (1 - a) u²``; clusters values at 0."""
@@ -20,7 +18,7 @@ def stretch(unit: Float[Array, "..."], linear: float) -> Float[Array, "..."]:
 
 def unstretch(value: Float[Array, "..."], linear: float) -> Float[Array, "..."]:
     """Inverse of :func:`stretch`; its slope at 0 is the finite ``1 / linear``, where a bare square root has none."""
-    return 2 * value / (linear + safe_sqrt(linear * linear + 4 * (1 - linear) * value))
+    return 2 * value / (linear + jnp.sqrt(linear * linear + 4 * (1 - linear) * value))
 
 
 def _cubic(unit: Float[Array, "..."], count: int) -> tuple[Int[Array, "..."], tuple[Float[Array, "..."], ...]]:

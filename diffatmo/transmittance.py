@@ -10,12 +10,13 @@ import math
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from diffatmo import geometry, rays
 from diffatmo._types import Altitude, Cosine, Length, OpticalDepth, Scalar, Transmittance
 from diffatmo.atmosphere import Atmosphere
-from diffatmo.numerics import bounded_divide, per_parameter, safe_divide, safe_sqrt, scaled_erfcx
+from diffatmo.numerics import ERFCX_OF_ZERO, bounded_divide, per_parameter, safe_sqrt, scaled_erfcx
 
 _SHELL_STEPS = 3
 """Gauss nodes for the altitude, nearly quadratic in distance, between two shells."""
@@ -37,7 +38,7 @@ class Columns(NamedTuple):
 def edges(atmosphere: Atmosphere) -> tuple[Float[Array, " 3"], Float[Array, " 3"]]:
     """Altitudes a_i, km, and factors c_i, km^-1, with which the absorber's density is Σ c_i max(0, a_i - h)."""
     center, half_width = atmosphere.ozone_center_altitude, atmosphere.ozone_half_width
-    return center + half_width * jnp.array([1.0, 0.0, -1.0]), jnp.array([1.0, -2.0, 1.0]) / half_width
+    return center + half_width * np.array([1.0, 0.0, -1.0]), np.array([1.0, -2.0, 1.0]) / half_width
 
 
 def spectral_depth(atmosphere: Atmosphere, columns: Columns) -> Float[Array, "w ..."]:
@@ -69,10 +70,21 @@ def _rising(
     at the mean of h under the weight, it leaves sqrt(πH) exp(-h/H) erfcx(v / sqrt(H)) F: relative error (H/R)², 2e-6 on
     Earth. The mean lies H/2 (horizontal) to H (vertical) above the point.
     """
-    m = v / safe_sqrt(scale_height)
+    m = v / jnp.sqrt(scale_height)
     effective = altitude + scale_height * (1 - 0.5 / (1 + m * (2 / math.sqrt(math.pi) + m)))
-    factor = (radius + effective) / safe_sqrt(effective + perigee + 2 * radius)
+    factor = (radius + effective) / jnp.sqrt(effective + perigee + 2 * radius)
     return scaled_erfcx(m, -altitude / scale_height) * factor
+
+
+def _level(altitude: Altitude, scale_height: Scalar, radius: Scalar) -> Float[Array, "..."]:
+    """The same along a horizontal ray, from its perigee: v = 0."""
+    effective = altitude + 0.5 * scale_height
+    return (
+        ERFCX_OF_ZERO
+        * jnp.exp(-altitude / scale_height)
+        * (radius + effective)
+        / jnp.sqrt(effective + altitude + 2 * radius)
+    )
 
 
 def ramp_columns(
@@ -85,15 +97,17 @@ def ramp_columns(
     """
     t, w, _ = rays.rule(_SHELL_STEPS, jnp.result_type(start).name)
     from_center = radius + perigee
+    # A square millimetre more: a vertical line has its perigee at the planet's centre, where the root is 0.
+    squared = from_center * from_center + 1e-12
     a = altitudes.reshape(-1, *[1] * jnp.broadcast_arrays(perigee, start, end)[0].ndim)
     reach = safe_sqrt((a - perigee) * (a + perigee + 2 * radius))
     low, high = jnp.clip(start, -reach, reach), jnp.clip(end, -reach, reach)
-    total = jnp.zeros_like(low)
+    length, depth = high - low, a - perigee
     for position, weight in zip(t, w, strict=True):
-        z = low + (high - low) * position
-        h = perigee + safe_divide(z * z, safe_sqrt(from_center * from_center + z * z) + from_center)
-        total = total + weight * (a - h)
-    return (high - low) * total
+        z_squared = (low + length * position) ** 2
+        # Less the height above the perigee.
+        depth = depth - weight * z_squared / (jnp.sqrt(squared + z_squared) + from_center)
+    return length * depth
 
 
 @per_parameter
@@ -105,15 +119,15 @@ def _exponentials_to_top(
     A ray that falls to a perigee p and rises again has X(h, -mu) = 2 X(p, 0) - X(h, mu).
     """
     perigee = geometry.perigee_altitude(altitude, mu, radius)
-    v = jnp.abs(mu) * safe_sqrt((radius + altitude) / (1 + geometry.sine(mu)))
+    v = jnp.abs(mu) * jnp.sqrt((radius + altitude) / (1 + geometry.sine(mu)))
     rise = jnp.maximum(top - altitude, 0)
     v_top = v + bounded_divide(rise, v + safe_sqrt(v * v + rise))
     lowest = jnp.maximum(perigee, 0)
     scale_height = heights.reshape(-1, *[1] * v.ndim)
     here = _rising(altitude, perigee, v, scale_height, radius)
     above = _rising(altitude + rise, perigee, v_top, scale_height, radius)
-    level = _rising(lowest, lowest, jnp.zeros_like(v), scale_height, radius)
-    return safe_sqrt(math.pi * scale_height) * (jnp.where(mu < 0, 2 * level - here, here) - above)
+    level = _level(lowest, scale_height, radius)
+    return jnp.sqrt(math.pi * scale_height) * (jnp.where(mu < 0, 2 * level - here, here) - above)
 
 
 def to_top(atmosphere: Atmosphere, altitude: Altitude, mu: Cosine) -> tuple[Columns, Bool[Array, "..."]]:
@@ -147,13 +161,10 @@ def columns_along(
     densities = exponentials(scale_heights(atmosphere), nodes.altitude)
     inside, whole = rays.accumulate(densities, nodes, steps)
     tops, _ = edges(atmosphere)
-    ends = start + jnp.sum(nodes.weight, axis=-1)
-    return (
-        Columns(
-            inside, ramp_columns(tops, perigee[..., None], start[..., None], start[..., None] + nodes.distance, radius)
-        ),
-        Columns(whole, ramp_columns(tops, perigee, start, ends, radius)),
-    )
+    length = jnp.sum(nodes.weight, axis=-1, keepdims=True)
+    ends = start[..., None] + jnp.concatenate([nodes.distance, length], axis=-1)
+    ramps = ramp_columns(tops, perigee[..., None], start[..., None], ends, radius)
+    return Columns(inside, ramps[..., :-1]), Columns(whole, ramps[..., -1])
 
 
 def along(atmosphere: Atmosphere, altitude: Altitude, mu: Cosine, distance: Length, steps: int = 48) -> Transmittance:

@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float
 from diffatmo import geometry, rays, table
 from diffatmo._types import Altitude, Cosine, Scalar
 from diffatmo.models.moments.angular import cosines, orders, plane, polar, projection, relative_nu
-from diffatmo.numerics import gauss_legendre, safe_divide, safe_sqrt
+from diffatmo.numerics import gauss_legendre, safe_divide
 
 ALTITUDE_LINEAR = 0.04
 """Linear part of the map of altitude nodes (clusters them in the aerosol layer)."""
@@ -155,7 +155,7 @@ class Shell(eqx.Module):
 
 def grazing(radius: Scalar, top: Altitude) -> Scalar:
     """:data:`GRAZING` on a planet of another shape, with a scale height of 8 % of the atmosphere's thickness."""
-    return safe_sqrt(2 * 0.08 * top / radius)
+    return jnp.sqrt(2 * 0.08 * top / radius)
 
 
 def sun_range(radius: Scalar, top: Altitude) -> tuple[Scalar, Scalar]:
