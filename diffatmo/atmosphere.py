@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 
 from diffatmo import constants, spectrum
 from diffatmo._types import Altitude, Scalar, Spectrum
+from diffatmo.numerics import array
 from diffatmo.phase import MIE_PHASES, PhaseTable, Shape
 
 
@@ -63,12 +64,6 @@ class DensityProfile(eqx.Module):
         )
 
 
-def _array(value: Any) -> Array:
-    # What is too large for single precision is refused as infinite, without a warning.
-    with np.errstate(over="ignore"):
-        return jnp.asarray(value, dtype=jnp.result_type(float))
-
-
 class Atmosphere(eqx.Module):
     """All parameters of a planet's sky, at ``w`` wavelengths.
 
@@ -77,20 +72,20 @@ class Atmosphere(eqx.Module):
     nothing. Raises :class:`AtmosphereError` for a value outside its range.
     """
 
-    wavelengths: Spectrum = eqx.field(converter=_array)
-    solar_irradiance: Spectrum = eqx.field(converter=_array)
-    bottom_radius: Scalar = eqx.field(converter=_array)
-    top_radius: Scalar = eqx.field(converter=_array)
-    rayleigh_scattering: Spectrum = eqx.field(converter=_array)
-    rayleigh_scale_height: Scalar = eqx.field(converter=_array)
-    mie_scattering: Spectrum = eqx.field(converter=_array)
-    mie_absorption: Spectrum = eqx.field(converter=_array)
-    mie_scale_height: Scalar = eqx.field(converter=_array)
-    mie_g: Scalar = eqx.field(converter=_array)
-    ozone_absorption: Spectrum = eqx.field(converter=_array)
-    ground_albedo: Spectrum = eqx.field(converter=_array)
-    ozone_center_altitude: Scalar = eqx.field(converter=_array, default=25.0)
-    ozone_half_width: Scalar = eqx.field(converter=_array, default=15.0)
+    wavelengths: Spectrum = eqx.field(converter=array)
+    solar_irradiance: Spectrum = eqx.field(converter=array)
+    bottom_radius: Scalar = eqx.field(converter=array)
+    top_radius: Scalar = eqx.field(converter=array)
+    rayleigh_scattering: Spectrum = eqx.field(converter=array)
+    rayleigh_scale_height: Scalar = eqx.field(converter=array)
+    mie_scattering: Spectrum = eqx.field(converter=array)
+    mie_absorption: Spectrum = eqx.field(converter=array)
+    mie_scale_height: Scalar = eqx.field(converter=array)
+    mie_g: Scalar = eqx.field(converter=array)
+    ozone_absorption: Spectrum = eqx.field(converter=array)
+    ground_albedo: Spectrum = eqx.field(converter=array)
+    ozone_center_altitude: Scalar = eqx.field(converter=array, default=25.0)
+    ozone_half_width: Scalar = eqx.field(converter=array, default=15.0)
     mie_phase: Shape = eqx.field(static=True, default="henyey-greenstein")
 
     def __check_init__(self) -> None:
@@ -341,7 +336,7 @@ def earth(wavelengths: Any = None) -> Atmosphere:
         solar, air = jnp.ones(3), jnp.array([5.802e-3, 13.558e-3, 33.1e-3])
         ozone = jnp.array([0.650e-3, 1.881e-3, 0.085e-3])
     else:
-        bands = _array(wavelengths)
+        bands = array(wavelengths)
         solar, air = spectrum.solar_irradiance(bands), spectrum.rayleigh_scattering(bands)
         ozone = spectrum.ozone_absorption(bands, column_du=300.0)
     ones = jnp.ones_like(bands)

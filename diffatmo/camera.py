@@ -20,15 +20,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from diffatmo._types import Direction, Scalar
-from diffatmo.numerics import safe_divide, safe_norm, safe_sqrt
+from diffatmo.numerics import array, safe_divide, safe_norm, safe_sqrt
 
 
 class CameraError(ValueError):
     """A camera's size or angle is out of range; the message says what would be right."""
-
-
-def _array(value: Any) -> Array:
-    return jnp.asarray(value, dtype=jnp.result_type(float))
 
 
 def _turn(matrix: Float[Array, "3 3"], vectors: Direction) -> Direction:
@@ -79,7 +75,7 @@ class Camera(eqx.Module):
         return (x >= -0.5) & (x <= self.width - 0.5) & (y >= -0.5) & (y <= self.height - 0.5)
 
     def _grid(self) -> tuple[Float[Array, "height width"], Float[Array, "height width"]]:
-        x, y = jnp.meshgrid(_array(jnp.arange(self.width)), _array(jnp.arange(self.height)))
+        x, y = jnp.meshgrid(array(np.arange(self.width)), array(np.arange(self.height)))
         return x, y
 
     def rotation(self) -> Float[Array, "3 3"]:
@@ -214,9 +210,9 @@ class Equirectangular(Camera):
 
     height: int = eqx.field(static=True)
     width: int = eqx.field(static=True)
-    yaw: Scalar = eqx.field(converter=_array, default=0.0)
-    pitch: Scalar = eqx.field(converter=_array, default=0.0)
-    roll: Scalar = eqx.field(converter=_array, default=0.0)
+    yaw: Scalar = eqx.field(converter=array, default=0.0)
+    pitch: Scalar = eqx.field(converter=array, default=0.0)
+    roll: Scalar = eqx.field(converter=array, default=0.0)
     upper: bool = eqx.field(static=True, default=False)
 
     def __check_init__(self) -> None:
@@ -254,7 +250,7 @@ class Equirectangular(Camera):
 
     def _solid_angles(self) -> Float[Array, "height width"]:
         # Exact: 2π/width (cos θ_top - cos θ_bottom).
-        zenith = (_array(jnp.arange(self.height)) + 0.5) * self.pixel_angle
+        zenith = (array(np.arange(self.height)) + 0.5) * self.pixel_angle
         row = 2 * np.pi / self.width * 2 * np.sin(self.pixel_angle / 2) * jnp.sin(zenith)
         return jnp.broadcast_to(row[:, None], (self.height, self.width))
 
@@ -308,13 +304,13 @@ class Fisheye(Camera):
 
     height: int = eqx.field(static=True)
     width: int = eqx.field(static=True)
-    fov: Scalar = eqx.field(converter=_array, default=np.pi)
-    yaw: Scalar = eqx.field(converter=_array, default=np.pi)
-    pitch: Scalar = eqx.field(converter=_array, default=np.pi / 2)
-    roll: Scalar = eqx.field(converter=_array, default=0.0)
+    fov: Scalar = eqx.field(converter=array, default=np.pi)
+    yaw: Scalar = eqx.field(converter=array, default=np.pi)
+    pitch: Scalar = eqx.field(converter=array, default=np.pi / 2)
+    roll: Scalar = eqx.field(converter=array, default=0.0)
     mapping: str = eqx.field(static=True, default="equidistant")
-    distortion: Float[Array, " k"] = eqx.field(converter=_array, default=())
-    circle: Scalar = eqx.field(converter=_array, default=1.0)
+    distortion: Float[Array, " k"] = eqx.field(converter=array, default=())
+    circle: Scalar = eqx.field(converter=array, default=1.0)
 
     def __check_init__(self) -> None:
         _check(self)
@@ -393,11 +389,11 @@ class Pinhole(Camera):
 
     height: int = eqx.field(static=True)
     width: int = eqx.field(static=True)
-    fov_y: Scalar = eqx.field(converter=_array, default=np.pi / 3)
-    yaw: Scalar = eqx.field(converter=_array, default=0.0)
-    pitch: Scalar = eqx.field(converter=_array, default=0.0)
-    roll: Scalar = eqx.field(converter=_array, default=0.0)
-    distortion: Float[Array, " k"] = eqx.field(converter=_array, default=())
+    fov_y: Scalar = eqx.field(converter=array, default=np.pi / 3)
+    yaw: Scalar = eqx.field(converter=array, default=0.0)
+    pitch: Scalar = eqx.field(converter=array, default=0.0)
+    roll: Scalar = eqx.field(converter=array, default=0.0)
+    distortion: Float[Array, " k"] = eqx.field(converter=array, default=())
 
     def __check_init__(self) -> None:
         _check(self)

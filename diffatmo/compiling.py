@@ -7,7 +7,6 @@ from typing import Any, ParamSpec, TypeVar
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 P = ParamSpec("P")
@@ -43,9 +42,14 @@ def compiler_options() -> dict[str, bool | int | str]:
 
 
 @lru_cache
+def _few_calls() -> dict[str, bool | int | str]:
+    return _known(_CPU_FEW_CALLS)
+
+
+@lru_cache
 def outermost(function: Callable[P, T]) -> Callable[P, T]:
     """``function`` compiled quickly, as it runs a few times only. Not for what may be called inside another ``jit``."""
-    options: Any = {"compiler_options": _known(_CPU_FEW_CALLS)}
+    options: Any = {"compiler_options": _few_calls()}
     compiled: Callable[P, T] = eqx.filter_jit(function, **options)
     return compiled
 
@@ -58,7 +62,7 @@ def compile_ahead(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -
     """
 
     def known(leaf: Any) -> Any:
-        return jnp.asarray(np.zeros(leaf.shape, leaf.dtype)) if isinstance(leaf, jax.ShapeDtypeStruct) else leaf
+        return jax.device_put(np.zeros(leaf.shape, leaf.dtype)) if isinstance(leaf, jax.ShapeDtypeStruct) else leaf
 
     compiled: Any = outermost(function)
     arguments, options = jax.tree.map(known, (args, kwargs))

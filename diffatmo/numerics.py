@@ -24,6 +24,19 @@ def tiny(dtype: jnp.dtype) -> float:
     return 2 * float(np.sqrt(np.finfo(dtype).tiny))
 
 
+def array(value: Any, dtype: Any = None) -> Array:
+    """``value`` in the ``dtype``, by default that of real numbers at present.
+
+    What NumPy or Python hold is moved as it is, where ``jnp.asarray`` compiles a program for every shape. What is too large
+    for single precision becomes infinite, without a warning.
+    """
+    dtype = jnp.result_type(float) if dtype is None else dtype
+    if any(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(value)):
+        return jnp.asarray(value, dtype)
+    with np.errstate(over="ignore"):
+        return jax.device_put(np.asarray(value, dtype))
+
+
 def whole_products(function: Callable[P, T]) -> Callable[P, T]:
     """``function``, with products of matrices in the precision of their numbers.
 

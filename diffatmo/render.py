@@ -1,7 +1,5 @@
 """A picture of a sky: camera × model → radiance at every pixel and wavelength."""
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -14,6 +12,7 @@ from diffatmo.atmosphere import Atmosphere
 from diffatmo.camera import Camera
 from diffatmo.constants import SUN_ANGULAR_RADIUS
 from diffatmo.models import Model, Moments, Path, PathTrace, View
+from diffatmo.numerics import array
 
 TILE_PIXELS = 2**16
 """Pixels computed at a time; bounds the memory of a large picture."""
@@ -37,10 +36,6 @@ RESOLVED = 20.0
 """Diameter of the sun in pixels from which its disc is evaluated pixel by pixel."""
 
 
-def _array(value: Any) -> Array:
-    return jnp.asarray(value, dtype=jnp.result_type(float))
-
-
 class Scene(eqx.Module):
     """All that a picture depends on: air, camera, its altitude (km), the unit vector to the sun, and the exposure.
 
@@ -49,9 +44,9 @@ class Scene(eqx.Module):
 
     atmosphere: Atmosphere
     camera: Camera
-    altitude: Scalar = eqx.field(converter=_array)
-    sun: Direction = eqx.field(converter=_array)
-    exposure: Scalar = eqx.field(converter=_array, default=1.0)
+    altitude: Scalar = eqx.field(converter=array)
+    sun: Direction = eqx.field(converter=array)
+    exposure: Scalar = eqx.field(converter=array, default=1.0)
 
 
 @eqx.filter_jit

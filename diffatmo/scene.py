@@ -16,6 +16,7 @@ import tomli_w
 from jaxtyping import Float
 
 from diffatmo import atmosphere, camera, imageio, sun
+from diffatmo.numerics import array
 from diffatmo.render import Scene
 
 ATTRIBUTE = "diffatmo"
@@ -83,9 +84,9 @@ def _scene(data: dict[str, Any]) -> tuple[Scene, dict[str, Any]]:
     scene = Scene(
         atmosphere=atmosphere.from_dict(data["atmosphere"]),
         camera=camera.from_dict(data["camera"]),
-        altitude=jnp.asarray(float(data["altitude_km"])),
-        sun=jnp.asarray(towards, dtype=jnp.result_type(float)),
-        exposure=jnp.asarray(float(data["exposure"])),
+        altitude=array(data["altitude_km"]),
+        sun=array(towards),
+        exposure=array(data["exposure"]),
     )
     notes = data.get("notes", {})
     if not isinstance(notes, dict):

@@ -38,7 +38,7 @@ class Columns(NamedTuple):
 def edges(atmosphere: Atmosphere) -> tuple[Float[Array, " 3"], Float[Array, " 3"]]:
     """Altitudes a_i, km, and factors c_i, km^-1, with which the absorber's density is Σ c_i max(0, a_i - h)."""
     center, half_width = atmosphere.ozone_center_altitude, atmosphere.ozone_half_width
-    return center + half_width * np.array([1.0, 0.0, -1.0]), np.array([1.0, -2.0, 1.0]) / half_width
+    return center + half_width * np.array([1.0, 0.0, -1.0]), jnp.divide(np.array([1.0, -2.0, 1.0]), half_width)
 
 
 def spectral_depth(atmosphere: Atmosphere, columns: Columns) -> Float[Array, "w ..."]:

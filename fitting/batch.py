@@ -12,6 +12,7 @@ from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Float
 
 from diffatmo.camera import Camera
+from diffatmo.numerics import array
 from fitting._errors import FitError
 from fitting.nuisances import (
     AEROSOL,
@@ -128,13 +129,13 @@ def stack(observations: Sequence[Observation], wavelengths: Sequence[float], mes
         return number(np.stack(rows))
 
     def number(value: Any) -> Array:
-        array = np.asarray(value)
-        return jnp.asarray(array, dtype=bool if array.dtype == bool else jnp.result_type(float))
+        value = np.asarray(value)
+        return array(value, bool if value.dtype == bool else None)
 
     directions = padded("directions", np.array([0, 0, 1], dtype=np.float32))[..., None, :]
     if any(observation.block > 1 for observation in observations):
         first, second = jnp.moveaxis(padded("spread", np.float32(0)), -2, 0)[..., None, :]
-        signs = jnp.asarray([[1, 1], [1, -1], [-1, 1], [-1, -1]], first.dtype)[..., None]
+        signs = array([[1, 1], [1, -1], [-1, 1], [-1, -1]], first.dtype)[..., None]
         directions = directions + signs[:, 0] * first + signs[:, 1] * second
         directions = directions / jnp.linalg.norm(directions, axis=-1, keepdims=True)
     seeing = [observation.bands.response for observation in observations if observation.bands is not None]

@@ -18,11 +18,22 @@ asks.
 """
 
 from abc import abstractmethod
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
+
+from diffatmo.numerics import array
+
+
+def _of_jax(value: Any) -> Array:
+    return array(value, value.dtype)
+
+
+Numbers: TypeAlias = Float[Array, "..."] | Float[np.ndarray, "..."]
 
 
 class Bijection(eqx.Module):
@@ -45,8 +56,8 @@ class Bijection(eqx.Module):
 class Log(Bijection):
     """value = lower + unit exp(y), within a factor e^±REACH of ``unit``."""
 
-    lower: Float[Array, "..."]
-    unit: Float[Array, "..."]
+    lower: Numbers = eqx.field(converter=_of_jax)
+    unit: Numbers = eqx.field(converter=_of_jax)
 
     REACH = 7.0
 
@@ -67,8 +78,8 @@ class Log(Bijection):
 class Logit(Bijection):
     """value = lower + (upper - lower) / (1 + exp(-y)), up to e^-REACH of the width from the ends."""
 
-    lower: Float[Array, "..."]
-    upper: Float[Array, "..."]
+    lower: Numbers = eqx.field(converter=_of_jax)
+    upper: Numbers = eqx.field(converter=_of_jax)
 
     REACH = 7.0
 
@@ -90,8 +101,8 @@ class Logit(Bijection):
 class Linear(Bijection):
     """value = unit y, from 0 to ``upper`` inclusive."""
 
-    unit: Float[Array, "..."]
-    upper: Float[Array, "..."]
+    unit: Numbers = eqx.field(converter=_of_jax)
+    upper: Numbers = eqx.field(converter=_of_jax)
 
     def value(self, y):
         """See :class:`Bijection`."""

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array
@@ -43,7 +42,7 @@ def gathered(found: Array, mesh: Mesh | None) -> Array:
     if mesh is None:
         return found
     everywhere = jax.jit(lambda x: x, out_shardings=NamedSharding(mesh, PartitionSpec()))(found)
-    return jnp.asarray(np.asarray(everywhere))
+    return jax.device_put(np.asarray(everywhere))
 
 
 def collected(found: Linearisation, mesh: Mesh | None) -> Linearisation:

@@ -25,6 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from diffatmo.numerics import array
 from fitting.batch import Batch
 from fitting.linearisation import Linearisation
 from fitting.nuisances import Nuisances
@@ -115,7 +116,7 @@ def eliminate(y: Coordinates, linearisation: Linearisation, problem: Problem) ->
         return y
     x, linear = problem.split(y)
     better, _ = optimum(np.asarray(linear, dtype=np.float64), columns, nuisances)
-    return jnp.concatenate([x, jnp.asarray(better, y.dtype)])
+    return jnp.concatenate([x, array(better, y.dtype)])
 
 
 def starting(radiance: np.ndarray, batch: Batch) -> Float[np.ndarray, " k"]:

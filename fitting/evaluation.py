@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 
 from diffatmo.compiling import outermost
 from diffatmo.models.base import Model
+from diffatmo.numerics import array
 from fitting import model_error
 from fitting._errors import FitError
 from fitting.batch import Batch, stack
@@ -32,7 +33,7 @@ def pose(batch: Batch, parameters: Parameters, priors: Sequence[Prior], loss: st
     signal, shell = batch.measured, eqx.filter_eval_shape(planet_shell, model, parameters)
     robust = None if loss is None else Loss(loss, jnp.ones((), signal.dtype))
     fields = Fields.of(batch, FIELD_DEGREE)
-    weight = outermost(weights)(batch, jnp.asarray(measured_light(batch), signal.dtype))
+    weight = outermost(weights)(batch, array(measured_light(batch), signal.dtype))
     return Problem(
         model, parameters, batch, weight, shell, jnp.ones_like(signal), collect(priors, parameters), robust, fields
     )
@@ -80,7 +81,7 @@ def rescaled(y: Coordinates, radiance: Predicted, problem: Problem) -> Problem:
     if problem.loss is None:
         return problem
     found = scale(np.asarray(outermost(whitened)(y, radiance, problem)), np.asarray(problem.batch.used))
-    return replace(problem, loss=Loss(problem.loss.name, jnp.asarray(found, y.dtype)))
+    return replace(problem, loss=Loss(problem.loss.name, array(found, y.dtype)))
 
 
 def restored(

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from statistics import NormalDist
 from typing import Any
 
-import jax.numpy as jnp
 import matplotlib
 import numpy as np
 from jaxtyping import Bool, Float
@@ -18,6 +17,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
 from diffatmo import color, skymask
+from diffatmo.numerics import array
 from fitting.findings import NINETY_FIVE, ONE_SIGMA, Findings, Profile
 from fitting.nuisances import channels
 from fitting.observation import Observation
@@ -50,14 +50,14 @@ def developed(
     observation: Observation, fitted: Image, wavelengths: Sequence[float]
 ) -> tuple[Float[np.ndarray, "height width 3"], Float[np.ndarray, "height width 3"]]:
     """The measured and the fitted image for a screen, through the same exposure and tone curve."""
-    bands = jnp.asarray(wavelengths if observation.bands is None else observation.bands.centres)
+    bands = array(wavelengths if observation.bands is None else observation.bands.centres)
     # In the shape of the image, whatever pixels are used, so that images of one size share one compiled program.
-    used = jnp.asarray(np.where(observation.used[..., None], observation.image, np.nan))
+    used = array(np.where(observation.used[..., None], observation.image, np.nan))
     exposure = color.auto_exposure(color.to_linear_srgb(used, wavelengths=bands))
 
     def develop(image: Image) -> Float[np.ndarray, "height width 3"]:
         known = observation.shown[..., None] & np.isfinite(image).all(axis=-1, keepdims=True)
-        rgb = color.display(jnp.asarray(np.where(known, image, 0)), wavelengths=bands, exposure=exposure)
+        rgb = color.display(array(np.where(known, image, 0)), wavelengths=bands, exposure=exposure)
         return np.where(known, rgb, _MASKED)
 
     return develop(observation.image), develop(fitted)

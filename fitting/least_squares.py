@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from diffatmo.compiling import outermost
 from fitting.linearisation import Linearisation
+from fitting.nuisances import Nuisances
 from fitting.parameters import Coordinates
 from fitting.problem import Linear, Problem
 
@@ -30,7 +31,7 @@ def slopes(
     """Derivatives of the residuals with respect to ``y``, from columns as those of :attr:`Linearisation.rows`."""
     colour, channel = problem.colours()
     nuisances = problem.batch.nuisances
-    exposure = _exposure(y, problem)[..., None]
+    exposure = _scales(problem.split(y)[1], problem)[0][..., None]
     tangents, lit, one = columns[..., :-3], exposure * columns[..., -3:-2], columns[..., -2:-1]
     touched = (channel == -1) | (np.arange(columns.shape[1])[:, None] == channel)
     of_atmosphere = np.where(touched[:, None], tangents[..., colour], 0) * exposure
@@ -45,16 +46,18 @@ def slopes(
     return np.concatenate([of_atmosphere, of_offsets, of_factors, of_pedestals], axis=-1)
 
 
-def _exposure(y: Coordinates, problem: Problem) -> Float[np.ndarray, "image w 1"]:
-    return _of_channels(problem.batch.exposure(problem.split(y)[1]))
+def _scales(linear: Linear, problem: Problem) -> tuple[Float[np.ndarray, "image w 1"], Float[np.ndarray, "image w 1"]]:
+    """What radiance is multiplied by, and what is added to it."""
+    batch = problem.batch
+    scales = outermost(_scales_of)(linear, batch.exposure_value, batch.nuisances)
+    exposure, pedestal = (np.swapaxes(np.asarray(scale, dtype=np.float64), 1, 2) for scale in scales)
+    return exposure, pedestal
 
 
-def _pedestal(linear: Linear, problem: Problem) -> Float[np.ndarray, "image w 1"]:
-    return _of_channels(problem.batch.nuisances.pedestal(linear))
-
-
-def _of_channels(values: Float[Array, "image 1 w"]) -> Float[np.ndarray, "image w 1"]:
-    return np.swapaxes(np.asarray(values, dtype=np.float64), 1, 2)
+def _scales_of(
+    linear: Linear, exposure_value: Float[Array, " image"], nuisances: Nuisances
+) -> tuple[Float[Array, "image 1 w"], Float[Array, "image 1 w"]]:
+    return exposure_value[:, None, None] * nuisances.factor(linear), nuisances.pedestal(linear)
 
 
 def jacobian(
@@ -65,9 +68,9 @@ def jacobian(
     The linearisation is that at the ``x`` in ``y``; its own linear nuisances may be others.
     """
     rows = np.asarray(linearisation.rows, dtype=np.float64)
-    before = jnp.concatenate([problem.split(y)[0], linearisation.linear])
-    brighter = _exposure(y, problem) - _exposure(before, problem)
-    raised = _pedestal(problem.split(y)[1], problem) - _pedestal(linearisation.linear, problem)
+    exposure, pedestal = _scales(problem.split(y)[1], problem)
+    exposure_then, pedestal_then = _scales(linearisation.linear, problem)
+    brighter, raised = exposure - exposure_then, pedestal - pedestal_then
     residual = rows[..., -1] + brighter * rows[..., -3] + raised * rows[..., -2]
     return residual.ravel(), slopes(y, rows, problem).reshape(residual.size, -1)
 
@@ -115,4 +118,4 @@ def _known_rows(y: Coordinates, problem: Problem) -> tuple[Float[Array, " k"], F
 def pushes(y: Coordinates, linearisation: Linearisation, problem: Problem) -> Float[np.ndarray, "image w b n"]:
     """Jᵀ of the residuals that a relative error of the light by each of the smooth fields, in one image and channel, causes."""
     columns = np.asarray(linearisation.pushes, dtype=np.float64)
-    return slopes(y, columns, problem) * _exposure(y, problem)[..., None]
+    return slopes(y, columns, problem) * _scales(problem.split(y)[1], problem)[0][..., None]

@@ -44,7 +44,7 @@ from jaxtyping import Array, Float, Int
 
 from diffatmo._types import Direction
 from diffatmo.color import LUMINANCE
-from diffatmo.numerics import safe_norm
+from diffatmo.numerics import array, safe_norm
 from fitting._errors import FitError
 from fitting.observation import FIXED, FREE, PER_CHANNEL, Observation
 
@@ -221,12 +221,12 @@ def gather(observations: Sequence[Observation], wavelengths: Sequence[float]) ->
     labels = [Label(name, "deg" if scale > 1 else "") for name, scale in zip(offsets, scales, strict=True)]
     return [*labels, *map(Label, [*factors, *pedestals])], Nuisances(
         moving=tuple(int(component) for component in moving),
-        offset_index=jnp.asarray(of_offsets[:, moving]),
-        unit=jnp.asarray(units, jnp.result_type(float)),
-        innovation=jnp.asarray(_innovation(len(offsets), times, _memory(observations)), jnp.result_type(float)),
-        per_unit=jnp.asarray(scales, jnp.result_type(float)),
-        factor_index=jnp.asarray(of_factors),
-        pedestal_index=jnp.asarray(of_pedestals),
+        offset_index=array(of_offsets[:, moving], int),
+        unit=array(units),
+        innovation=array(_innovation(len(offsets), times, _memory(observations))),
+        per_unit=array(scales),
+        factor_index=array(of_factors, int),
+        pedestal_index=array(of_pedestals, int),
         factors=len(factors),
         pedestals=len(pedestals),
     )

@@ -17,6 +17,7 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple, Protocol
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -507,8 +508,10 @@ class Noisy(Protocol):
 
 def sigma(of: Noisy, light: Float[Array, "*pixels w"] | np.ndarray) -> Float[Array, "*pixels w"]:
     """Standard deviation of pixels with the signal ``light``, which a pedestal is not part of."""
-    positive = jnp.maximum(light, 0)
-    return jnp.sqrt((of.noise * positive) ** 2 + of.noise_shot * positive + of.noise_floor**2)
+    # Of arrays of NumPy the result is one: every eager operation of JAX compiles a program for every shape.
+    xp = jnp if isinstance(light, jax.Array) else np
+    positive = xp.maximum(light, 0)
+    return xp.sqrt((of.noise * positive) ** 2 + of.noise_shot * positive + of.noise_floor**2)
 
 
 def unstack(observation: Observation, values: Float[np.ndarray, "pixel w"]) -> Float[np.ndarray, "height width w"]:

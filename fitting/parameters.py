@@ -24,13 +24,15 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeAlias
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from diffatmo import spectrum
 from diffatmo.atmosphere import SPECTRAL, Atmosphere
-from diffatmo.numerics import safe_divide
+from diffatmo.compiling import outermost
+from diffatmo.numerics import array, safe_divide
 from diffatmo.phase import PhaseTable
 from fitting._errors import FitError
 from fitting.bijections import Bijection, Linear, Log, Logit
@@ -155,10 +157,10 @@ class Aerosol(Block):
         start = [0.0, alpha, *[float(absorbed.mean()) / cls.ABSORBED] * absorption]
         dtype = init.mie_extinction.dtype
         return cls(
-            extinction=jnp.asarray(np.exp(level), dtype),
+            extinction=array(np.exp(level), dtype),
             absorbed=None if absorption else absorbed,
             ratio=ratio,
-            start=jnp.asarray(start, dtype),
+            start=array(start, dtype),
         )
 
     @property
@@ -174,7 +176,7 @@ class Aerosol(Block):
     @property
     def limits(self) -> tuple[Coordinates, Coordinates]:
         """See :class:`Block`."""
-        lower, upper = (jnp.asarray(limit[: self.start.size], self.start.dtype) for limit in self.LIMITS)
+        lower, upper = (array(limit[: self.start.size], self.start.dtype) for limit in self.LIMITS)
         return lower, upper
 
     def values(self, y):
@@ -265,7 +267,7 @@ class Parameters(eqx.Module):
         return np.array(colour), np.array(channel)
 
 
-_Choice: TypeAlias = Callable[[Atmosphere, Array, Array], Bijection]
+_Choice: TypeAlias = Callable[[Atmosphere, np.ndarray, np.ndarray], Bijection]
 """The bijection of a value: from the atmosphere at the start, the start value, and one over the unit it is given in."""
 
 
@@ -273,8 +275,8 @@ def _positive(typical: float) -> _Choice:
     """Log around the start value; a field with a zero in it is linear instead, to be able to leave it."""
     linear = _maybe_zero(typical)
 
-    def choose(init: Atmosphere, value: Array, per_unit: Array) -> Bijection:
-        return Log(jnp.zeros_like(value), value) if bool(jnp.all(value > 0)) else linear(init, value, per_unit)
+    def choose(init: Atmosphere, value: np.ndarray, per_unit: np.ndarray) -> Bijection:
+        return Log(np.zeros_like(value), value) if bool(np.all(value > 0)) else linear(init, value, per_unit)
 
     return choose
 
@@ -282,27 +284,27 @@ def _positive(typical: float) -> _Choice:
 def _maybe_zero(typical: float, upper: float = jnp.inf) -> _Choice:
     """Linear, in units of the largest start value, or of the ``typical`` one if the start is zero."""
 
-    def choose(init: Atmosphere, value: Array, per_unit: Array) -> Bijection:
+    def choose(init: Atmosphere, value: np.ndarray, per_unit: np.ndarray) -> Bijection:
         del init
-        largest = float(jnp.max(value))
-        unit = jnp.full_like(value, largest) if largest > 0 else jnp.full_like(value, typical) / per_unit
+        largest = float(np.max(value))
+        unit = np.full_like(value, largest) if largest > 0 else np.full_like(value, typical) / per_unit
         # Where there is a shape, a little below the bound, because its product with the factor is rounded.
-        bound = jnp.full_like(value, upper) / per_unit
-        return Linear(unit, jnp.where(per_unit == 1, bound, (1 - 1e-6) * bound))
+        bound = np.full_like(value, upper) / per_unit
+        return Linear(unit, np.where(per_unit == 1, bound, (1 - 1e-6) * bound))
 
     return choose
 
 
 _CHOICES: dict[str, _Choice] = {
     "solar_irradiance": _positive(1.0),
-    "bottom_radius": lambda init, value, _: Logit(jnp.zeros_like(value), init.top_radius[None]),
-    "top_radius": lambda init, value, _: Log(init.bottom_radius[None], init.top_altitude[None]),
+    "bottom_radius": lambda init, value, _: Logit(np.zeros_like(value), np.asarray(init.top_radius)[None]),
+    "top_radius": lambda init, value, _: Log(np.asarray(init.bottom_radius)[None], np.asarray(init.top_altitude)[None]),
     "rayleigh_scattering": _positive(1e-2),
     "rayleigh_scale_height": _positive(8.0),
     "mie_scattering": _positive(4e-3),
     "mie_absorption": _maybe_zero(4e-4),
     "mie_scale_height": _positive(1.2),
-    "mie_g": lambda init, value, _: Logit(-jnp.ones_like(value), jnp.ones_like(value)),
+    "mie_g": lambda init, value, _: Logit(-np.ones_like(value), np.ones_like(value)),
     "ozone_absorption": _maybe_zero(1e-3),
     "ground_albedo": _maybe_zero(0.3, upper=1.0),
     "ozone_center_altitude": _positive(25.0),
@@ -379,32 +381,37 @@ def _check_ties(tie: dict[str, str], free: Sequence[str]) -> None:
 
 
 def _single(init: Atmosphere, field: str, tie: str | None) -> Single:
-    value = jnp.atleast_1d(getattr(init, field))
+    value = np.atleast_1d(np.asarray(getattr(init, field)))
     shape = None
     if tie is not None:
         shape = _shape(init, field, tie)
-        value = (jnp.sum(value) / jnp.sum(shape))[None]
-    per_unit = jnp.ones(1, value.dtype) if shape is None else jnp.max(shape)[None]
+        value = (np.sum(value) / np.sum(shape))[None]
+    per_unit = np.ones(1, value.dtype) if shape is None else np.max(shape)[None]
     bijection = _CHOICES[field](init, value, per_unit)
-    lower, upper = bijection.limits
-    start = jnp.clip(bijection.coordinate(value), lower, upper)
-    return Single(field=field, bijection=bijection, start=start, shape=shape)
+    start = outermost(_coordinate)(bijection, value)
+    return Single(field=field, bijection=bijection, start=start, shape=None if shape is None else jax.device_put(shape))
 
 
-def _shape(init: Atmosphere, field: str, tie: str) -> Float[Array, " w"]:
+def _coordinate(bijection: Bijection, value: Array) -> Array:
+    return jnp.clip(bijection.coordinate(value), *bijection.limits)
+
+
+def _shape(init: Atmosphere, field: str, tie: str) -> Float[np.ndarray, " w"]:
     """The spectrum of a tied field, in the unit of its factor."""
-    value = getattr(init, field)
+    value, wavelengths = np.asarray(getattr(init, field)), np.asarray(init.wavelengths)
     if tie == START:
-        if not bool(jnp.any(value > 0)):
+        if not bool(np.any(value > 0)):
             raise FitError(
                 f"tie: {field} = {START!r}: it starts at zero at every wavelength, so no factor can change it"
             )
         return value
     if tie == LAMBDA_4:
-        return (init.wavelengths / REFERENCE_NM) ** -4
+        return (wavelengths / REFERENCE_NM) ** -4
     if tie == DOBSON:
         try:
-            return spectrum.ozone_absorption(init.wavelengths, column_du=1.0, half_width=init.ozone_half_width)
+            return np.asarray(
+                spectrum.ozone_absorption(init.wavelengths, column_du=1.0, half_width=init.ozone_half_width)
+            )
         except ValueError as error:
             raise FitError(f"tie: {field} = {DOBSON!r}: {error}") from error
-    return jnp.ones_like(value)
+    return np.ones_like(value)

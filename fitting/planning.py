@@ -37,7 +37,7 @@ from diffatmo.atmosphere import Atmosphere
 from diffatmo.camera import Camera, Fisheye, Pinhole
 from diffatmo.compiling import compile_ahead, outermost
 from diffatmo.models import Model, Moments
-from diffatmo.numerics import safe_log
+from diffatmo.numerics import array, safe_log
 from fitting._errors import FitError
 from fitting.batch import Batch, stack
 from fitting.elimination import eliminate, starting, without
@@ -109,7 +109,7 @@ class Photo(Shot):
 
     def camera(self, size: int = FRAME) -> Camera:
         """The camera, with square frames of ``size`` pixels across."""
-        fov, yaw, pitch = (jnp.asarray(angle) for angle in (self.fov, self.yaw, self.pitch))
+        fov, yaw, pitch = (array(angle) for angle in (self.fov, self.yaw, self.pitch))
         if self.fov >= math.pi:
             return Fisheye(size, size, fov=fov, yaw=yaw, pitch=pitch)
         return Pinhole(size, size, fov_y=fov, yaw=yaw, pitch=pitch)
@@ -237,7 +237,7 @@ def of_observations(observations: Sequence[Observation], parameters: Parameters,
     problem = replace(problem, shell=outermost(planet_shell)(model, parameters))
     found = evaluated(problem.start, jnp.zeros(batch.nuisances.linear, problem.start.dtype), problem)
     check_finite(np.asarray(found.bad), [observation.name for observation in observations], "in the atmosphere given")
-    linear = jnp.asarray(starting(np.asarray(found.radiance), batch), problem.start.dtype)
+    linear = array(starting(np.asarray(found.radiance), batch), problem.start.dtype)
     y = eliminate(jnp.concatenate([problem.start, linear]), found, problem)
     problem = replace(problem, weight=weights(batch, light(y, found.radiance, problem)))
     found = evaluated(*problem.split(y), problem)
@@ -343,7 +343,7 @@ def _direct_slope(y: Coordinates, parameters: Parameters, altitude: Array, mu_s:
 
 def _disc_information(shot: Shot, parameters: Parameters, sensor: Sensor, altitude: float) -> Information:
     start = parameters.start
-    place = [jnp.asarray(value, start.dtype) for value in (altitude, math.cos(shot.sun_zenith))]
+    place = [array(value, start.dtype) for value in (altitude, math.cos(shot.sun_zenith))]
     slope = np.asarray(outermost(_direct_slope)(start, parameters, *place), dtype=np.float64)
     if not np.isfinite(slope).all():
         raise FitError(f"{shot.name}: the derivatives of the direct light are not finite")

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from diffatmo import constants, spectrum
 from diffatmo.atmosphere import Atmosphere
-from diffatmo.numerics import safe_log
+from diffatmo.numerics import array, safe_log
 from fitting._errors import FitError
 from fitting.parameters import Parameters
 from fitting.quantities import DERIVED, REFERENCE_NM, Quantity, numbers, quantities
@@ -89,10 +89,10 @@ def collect(priors: Sequence[Prior], parameters: Parameters) -> Priors | None:
     dtype = parameters.start.dtype
     return Priors(
         fields=tuple(fields),
-        index=jnp.asarray(index),
-        value=jnp.asarray([prior.value for prior in stated], dtype),
-        error=jnp.asarray([prior.error for prior in stated], dtype),
-        relative=jnp.asarray([prior.relative for prior in stated]),
+        index=array(index, int),
+        value=array([prior.value for prior in stated], dtype),
+        error=array([prior.error for prior in stated], dtype),
+        relative=array([prior.relative for prior in stated], bool),
     )
 
 

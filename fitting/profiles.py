@@ -25,6 +25,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from diffatmo.compiling import outermost
+from diffatmo.numerics import array
 from fitting._errors import FitError
 from fitting.evaluation import evaluated, restored
 from fitting.findings import Estimate, Profile
@@ -126,7 +127,7 @@ def _optimum(result: FitResult) -> _Optimum:
             "profile: the result does not know its start, free parameters and model; fit again with this version"
         )
     parameters = select(setup.init, setup.free, setup.tie)
-    y = jnp.asarray(setup.coordinates, parameters.start.dtype)
+    y = array(setup.coordinates, parameters.start.dtype)
     # What is known of the offsets is part of the problem already.
     offsets = {name for name, *_ in assumed(result.observations)}
     known = [prior for prior in result.priors if prior.name not in offsets]

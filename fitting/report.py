@@ -55,13 +55,13 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
 from diffatmo import atmosphere, folders, imageio, scene, sun
 from diffatmo.atmosphere import Atmosphere
+from diffatmo.numerics import array
 from diffatmo.render import Scene
 from fitting._errors import FitError
 from fitting.figures import (
@@ -219,9 +219,9 @@ def scene_of(result: Findings, observation: Observation) -> Scene | None:
     return Scene(
         atmosphere=result.atmosphere,
         camera=observation.camera,
-        altitude=jnp.asarray(observation.altitude),
-        sun=jnp.asarray(observation.sun),
-        exposure=jnp.asarray(observation.exposure_value * factor),
+        altitude=array(observation.altitude),
+        sun=array(observation.sun),
+        exposure=array(observation.exposure_value * factor),
     )
 
 
@@ -309,7 +309,7 @@ def record(result: Findings) -> dict[str, Any]:
 
 def _sun_degrees(observation: Observation) -> tuple[float, float]:
     """Zenith angle and azimuth (clockwise from north) of the sun."""
-    zenith, azimuth = sun.angles(jnp.asarray(observation.sun))
+    zenith, azimuth = sun.angles(array(observation.sun))
     return math.degrees(zenith), math.degrees(azimuth)
 
 

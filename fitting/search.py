@@ -28,6 +28,7 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from diffatmo.compiling import outermost
+from diffatmo.numerics import array
 from fitting.batch import Batch
 from fitting.elimination import RANK_TOLERANCE, eliminate, profile
 from fitting.least_squares import Factor, reduce
@@ -216,7 +217,7 @@ def minimise(
                 size = size * (previous / misfit)
             state = eqx.tree_at(lambda s: (s.y_eval, s.search_state.step_size), state, (trial, size))
             change = float(np.max(np.abs(np.asarray(trial) - np.asarray(x))))
-            plane = jnp.asarray(held / math.sqrt(scale), dtype=x.dtype)
+            plane = array(held / math.sqrt(scale), x.dtype)
             x, state = outermost(_step)(x, state, (plane[:, -1], plane[:, :-1], trial))
             accepted = best is None or (finite and np.array_equal(x, trial))
             if best is None or accepted:
@@ -299,7 +300,7 @@ def _foreseen(best: Point, trial: Coordinates) -> Linear:
     step = np.asarray(trial, dtype=np.float64) - np.asarray(x, dtype=np.float64)
     left = best.triangle[:, -1] + slope @ step
     change = np.linalg.lstsq(of_linear / unit, -left, rcond=RANK_TOLERANCE)[0] / unit
-    return linear + jnp.asarray(change, linear.dtype)
+    return linear + array(change, linear.dtype)
 
 
 def count(batch: Batch) -> int:

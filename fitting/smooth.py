@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from diffatmo.numerics import array
 from fitting.batch import Batch
 
 SAMPLE = 4096
@@ -49,8 +50,7 @@ class Fields(eqx.Module):
             coefficient[:, : kept.sum()] = (right[kept].T / singular[kept]) * np.sqrt(own.size) / scale[:, None]
             centres.append(centre)
             coefficients.append(coefficient)
-        dtype = jnp.result_type(float)
-        return cls(degree, jnp.asarray(np.stack(centres), dtype), jnp.asarray(np.stack(coefficients), dtype))
+        return cls(degree, array(np.stack(centres)), array(np.stack(coefficients)))
 
     def at(
         self,

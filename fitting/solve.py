@@ -33,21 +33,22 @@ from jaxtyping import Float
 from diffatmo.atmosphere import Atmosphere
 from diffatmo.compiling import compile_ahead, outermost
 from diffatmo.models.base import Model
+from diffatmo.numerics import array
 from fitting import model_error
 from fitting._errors import FitError
 from fitting.batch import Batch, stack
 from fitting.checkpoint import Checkpoint, digest, load, save
 from fitting.devices import mesh_of
 from fitting.elimination import starting
-from fitting.evaluation import check_finite, corrected, evaluated, measured_light, pose, rescaled, weighed
+from fitting.evaluation import check_finite, corrected, evaluated, pose, rescaled, weighed
 from fitting.least_squares import Factor, known_rows, reduce_images
 from fitting.linearisation import Linearisation, linearise
 from fitting.mixing import mixed
 from fitting.nuisances import Label, gather
-from fitting.observation import Observation, sigma
+from fitting.observation import Observation
 from fitting.parameters import Coordinates, Parameters, select
 from fitting.priors import Prior
-from fitting.problem import Linear, Problem, expected, planet_shell, whitened
+from fitting.problem import Linear, Predicted, Problem, expected, planet_shell, whitened
 from fitting.search import ASTRAY, FIRST_PASS_TOLERANCE, INTERRUPTED, Point, Progress, Step, count, minimise
 from fitting.starts import APART, RIVAL, ranked, separation
 
@@ -178,7 +179,7 @@ class _Run:
     def begin(self, x: Coordinates, problem: Problem) -> tuple[Coordinates, Linearisation]:
         """``y`` with a start for the linear nuisances, and the linearisation there."""
         found = self.evaluate(x, jnp.zeros(problem.batch.nuisances.linear, x.dtype), problem)
-        linear = jnp.asarray(starting(np.asarray(found.radiance), problem.batch), x.dtype)
+        linear = array(starting(np.asarray(found.radiance), problem.batch), x.dtype)
         # Residuals of another exposure are differences of large numbers, and the weights of a robust loss are those of one.
         if np.any(np.abs(linear) > (0.1 if problem.loss is None else 0)):
             found = self.evaluate(x, linear, problem)
@@ -266,7 +267,7 @@ def _elsewhere(run: _Run, problem: Problem, rough: float, steps: int) -> Iterato
     """Where searches from other starts end, the most promising first, in up to so many steps together."""
     dtype, last = problem.start.dtype, len(run.history) + steps
     for point in ranked(problem):
-        x = jnp.asarray(np.append(point, np.zeros(problem.batch.nuisances.offsets)), dtype)
+        x = array(np.append(point, np.zeros(problem.batch.nuisances.offsets)), dtype)
         y, start = run.begin(x, problem)
         if not np.asarray(start.bad).any():
             yield run.search(y, problem, rough, aside=True, steps=last - len(run.history), start=start)
@@ -353,7 +354,7 @@ def _refined(run: _Run, found: _Found, finer: Model) -> tuple[_Found, Float[np.n
             rate = min(rate, LARGEST_RATE)
             if not best.converged or way * rate / (1 - rate) < LEFT:
                 break
-            here = jnp.asarray(mixed(places, images, metric), best.y.dtype)
+            here = array(mixed(places, images, metric), best.y.dtype)
             x, linear = problem.split(here)
             here = jnp.concatenate([jnp.clip(x, *problem.limits), linear])
             light = run.evaluate(*problem.split(here), alone).radiance
@@ -388,10 +389,10 @@ def _shares(best: Point, problem: Problem) -> dict[str, Any]:
     return shares
 
 
-def _check_weights(batch: Batch, names: Sequence[str]) -> None:
+def _check_weights(batch: Batch, weight: Predicted, names: Sequence[str]) -> None:
     """Refuse pixels whose noise single precision cannot square and divide by."""
     with np.errstate(all="ignore"):
-        whitened = np.asarray(batch.measured / sigma(batch, measured_light(batch)))
+        whitened = np.asarray(batch.measured) * np.asarray(weight)
     bad = np.asarray(batch.used) & ~(np.isfinite(whitened) & (whitened < LARGEST_SIGNAL)).all(axis=-1)
     bad |= np.asarray(batch.used) & ((whitened == 0) & (np.asarray(batch.measured) != 0)).any(axis=-1)
     for name, lost in zip(names, bad.sum(axis=1), strict=True):
@@ -444,8 +445,8 @@ def solve(
     size = parameters.size + batch.nuisances.size
     if count(batch) < size:
         raise FitError(f"{count(batch)} pixels and channels cannot determine {size} parameters; mask less or free less")
-    _check_weights(batch, names)
     problem, finer = pose(batch, parameters, priors, loss, model), model.finer() if refine else None
+    _check_weights(batch, problem.weight, names)
     compiling = _compile_ahead(problem, finer)
     problem = replace(problem, shell=outermost(planet_shell)(model, parameters))
     for thread in compiling[:1]:
@@ -456,7 +457,7 @@ def solve(
     else:
         run.history += [Step(**row) for row in saved.history]
         run.final, run.step_size = saved.final, saved.step_size
-        y = jnp.asarray(saved.y, problem.start.dtype)
+        y = array(saved.y, problem.start.dtype)
         start = run.evaluate(*problem.split(y), problem)
     check_finite(np.asarray(start.bad), names, "at the start")
     if run.final:

@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from diffatmo.compiling import outermost
+from diffatmo.numerics import array
 from fitting.batch import PIXEL_FIELDS, Batch
 from fitting.elimination import starting
 from fitting.parameters import Aerosol, Block, Coordinates, Parameters, Single
@@ -137,14 +138,12 @@ def ranked(problem: Problem) -> list[Float[np.ndarray, " n"]]:
     thin = replace(
         problem, batch=batch, weight=problem.weight[image, chosen], correction=None, priors=None, loss=None, fields=None
     )
-    found = np.asarray(
-        outermost(radiances)(jnp.asarray(points, problem.parameters.start.dtype), thin), dtype=np.float64
-    )
+    found = np.asarray(outermost(radiances)(array(points, problem.parameters.start.dtype), thin), dtype=np.float64)
     measured, noise = np.asarray(batch.measured, float), np.asarray(thin.weight, float)
     known = (measured > 0) & np.asarray(batch.used)[..., None]
     off = []
     for radiance in found:
-        expected = radiance * np.asarray(batch.exposure(jnp.asarray(starting(radiance, batch))))
+        expected = radiance * np.asarray(batch.exposure(array(starting(radiance, batch))))
         ratio = np.where(known, np.maximum(expected, 1e-30) / np.where(known, measured, 1), 1)
         off.append(float(np.mean(np.abs(np.log(ratio)) * noise * measured)))
     order = np.argsort(np.where(np.isfinite(off), off, np.inf), kind="stable")

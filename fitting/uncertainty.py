@@ -29,6 +29,7 @@ from jaxtyping import Array, Float
 from diffatmo.atmosphere import Atmosphere
 from diffatmo.compiling import outermost
 from diffatmo.models import Model, Moments
+from diffatmo.numerics import array
 from fitting.elimination import RANK_TOLERANCE
 from fitting.findings import Estimate, Minimum, Setup
 from fitting.nuisances import Nuisances, assumed
@@ -125,7 +126,10 @@ def summarise(
     shares = data_shares(of_images, factor, gradient)
     covariance = covariance + gradient @ solution.model_error @ gradient.T
     errors = [math.sqrt(v) if ok else None for v, ok in zip(np.diag(covariance), determined, strict=True)]
-    initial = np.asarray(numbers(parameters.atmosphere(parameters.start), fields + derived), dtype=float)
+    start = np.concatenate([parameters.start, np.zeros(solution.y.size - count)])
+    initial = np.asarray(
+        outermost(_slopes)(array(start, solution.y.dtype), parameters, solution.batch.nuisances)[1][0], dtype=float
+    )
     at_bound = parameters.at_bound(np.asarray(solution.y)[:count])
 
     estimates = [

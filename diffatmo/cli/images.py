@@ -344,7 +344,7 @@ def truth_of(shot: "Shot", init: "Atmosphere") -> "Atmosphere":
 
     truth = shot.scene.atmosphere
     order = matching(np.asarray(truth.wavelengths), np.asarray(init.wavelengths))
-    return replace(truth, **{name: getattr(truth, name)[order] for name in SPECTRAL})
+    return replace(truth, **{name: np.asarray(getattr(truth, name))[order] for name in SPECTRAL})
 
 
 def find_camera(options: Mapping[str, Any], pixels: "np.ndarray", shot: "Shot | None") -> "Camera":
