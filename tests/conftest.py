@@ -1,6 +1,7 @@
 """Fixtures shared by the whole suite."""
 
 import ctypes
+import gc
 import os
 from contextlib import suppress
 from functools import partial
@@ -17,6 +18,10 @@ from few_programs import COMPILE_FAST
 from diffatmo.atmosphere import Atmosphere
 
 matplotlib.use("Agg")
+
+# Half of what Python collects while programs are traced are the modules, which stay.
+gc.freeze()
+gc.set_threshold(50_000, 20, 20)
 
 
 PROGRAMS_AT_MOST = 2e9

@@ -192,13 +192,12 @@ def seen_and_slopes(radius, top, altitude):
     return values[0], slopes
 
 
-@pytest.mark.parametrize(
-    ("radius", "top", "altitude"),
-    [(6360.0, 1.0, 0.1), (6360.0, 20.0, 0.1), (70000.0, 80.0, 0.1), (1000.0, 0.1, 0.01), (6360.0, 100.0, 4e5)],
-)
-def test_thin_shells_and_far_observers_are_finite(radius, top, altitude):
+def test_thin_shells_and_far_observers_are_finite():
     """In float32: the fall of the light at dusk, and a planet smaller than a degree."""
-    value, slopes = seen_and_slopes(*[jnp.asarray(x, jnp.float32) for x in (radius, top, altitude)])
-    assert bool((value >= 0).all())
-    assert bool((value[1] > 0).all())
-    assert all(bool(jnp.isfinite(slope).all()) for slope in slopes)
+    for place in (
+        (6360.0, 1.0, 0.1), (6360.0, 20.0, 0.1), (70000.0, 80.0, 0.1), (1000.0, 0.1, 0.01), (6360.0, 100.0, 4e5),
+    ):  # fmt: skip
+        value, slopes = seen_and_slopes(*[jnp.asarray(x, jnp.float32) for x in place])
+        assert bool((value >= 0).all()), place
+        assert bool((value[1] > 0).all()), place
+        assert all(bool(jnp.isfinite(slope).all()) for slope in slopes), place
