@@ -28,6 +28,11 @@ PROGRAMS_AT_MOST = 2e9
 """Bytes of memory beyond which compiled programs are dropped: of the thousands that the suite needs, each is kept for ever."""
 
 
+def pytest_collection_modifyitems(items):
+    """The longest tests first, so that no process waits for them at the end."""
+    items.sort(key=lambda item: item.path.name != "test_gradients.py")
+
+
 @pytest.fixture(scope="session", autouse=True)
 def _keep_programs(tmp_path_factory):
     """Programs that were dropped, and those of the commands that tests start, are found again on disk.

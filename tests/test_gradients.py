@@ -42,7 +42,7 @@ NAMES = [f"{path[0].name}[{i}]" for path, leaf in LEAVES for i in range(leaf.siz
 def pack(atmosphere, sun_zenith_deg, altitude):
     """All numbers of the atmosphere, then the sun's direction and the altitude."""
     numbers = [np.asarray(x, float).ravel() for x in jax.tree.leaves(atmosphere)]
-    return jnp.asarray(np.concatenate([*numbers, unit(sun_zenith_deg, 20.0), [altitude]]))
+    return np.concatenate([*numbers, unit(sun_zenith_deg, 20.0), [altitude]])
 
 
 def unpack(x):
@@ -58,14 +58,16 @@ def make(model, how):
         # On the unit sphere, whatever step is taken.
         sun = x[-4:-1] / jnp.linalg.norm(x[-4:-1])
         sky = model.sky(unpack(x))
-        if how == "view":
-            return sky.view(altitude=x[-1], sun=sun).radiance(view=view).radiance
-        return sky.radiance(altitude=x[-1], view=view, sun=sun).radiance
+        asked = {
+            "view": lambda: sky.view(altitude=x[-1], sun=sun).radiance(view=view).radiance,
+            "path": lambda: sky.radiance(altitude=x[-1], view=view, sun=sun).radiance,
+        }
+        return jnp.concatenate([asked[way]() for way in how.split("+")])
 
     return radiance
 
 
-CASES = [("moments", "view"), ("bruneton", "path"), ("hillaire", "view"), ("raymarch", "path")]
+CASES = [("moments", "view+path"), ("bruneton", "path"), ("hillaire", "view"), ("raymarch", "path")]
 
 
 @pytest.mark.parametrize(("name", "how"), CASES)
@@ -76,23 +78,26 @@ def test_forward_and_reverse_against_differences(x64, name, how):
     """
     model = make(MODELS[name], how)
     # One random combination of all outputs: reverse mode of a sum that no coincidence makes right.
-    weight = jnp.asarray(np.random.default_rng(5).normal(size=(5, 3)))
+    weight = np.random.default_rng(5).normal(size=(5 * len(how.split("+")), 3))
     forward = jax.jit(lambda x, v: jax.jvp(model, (x,), (v,)), compiler_options=COMPILE_FAST)
     reverse = jax.jit(lambda x: jax.vjp(model, x)[1](weight)[0], compiler_options=COMPILE_FAST)
 
     def jacobian(x):
-        return jnp.stack([forward(x, v)[1] for v in jnp.eye(x.size)], axis=-1)
+        return np.stack([forward(x, v)[1] for v in np.eye(x.size)], axis=-1)
 
     x = pack(earth(), 50.0, 0.7)
     exact = jacobian(x)
-    # Linear interpolation has two derivatives at the entries of a table, and rounding chooses.
-    rtol = 1e-6 if name in ("bruneton", "hillaire") else 1e-8
-    np.testing.assert_allclose(reverse(x), jnp.tensordot(weight, exact, 2), rtol=rtol, atol=1e-12)
-    for i, v in enumerate(jnp.eye(x.size)):
-        step = 1e-5 * abs(float(x[i]) or 1)
-        numeric = (forward(x + step * v, v)[0] - forward(x - step * v, v)[0]) / (2 * step)
-        scale = float(jnp.abs(numeric).max()) + 1e-9
-        np.testing.assert_allclose(exact[..., i], numeric, atol=1e-5 * scale, err_msg=NAMES[i])
+    # Linear interpolation has two derivatives at the entries of a table, and rounding chooses. Where light moves with the
+    # planet's radii, terms (R/h)² larger than their sum cancel.
+    rtol = 1e-6 if name in ("bruneton", "hillaire") else 1e-7
+    terms = np.tensordot(np.abs(weight), np.abs(exact), 2)
+    assert (np.abs(reverse(x) - np.tensordot(weight, exact, 2)) <= rtol * terms).all()
+    steps = 1e-5 * np.where(x == 0, 1, np.abs(x))
+    for i, (number, step) in enumerate(zip(NAMES, np.diag(steps), strict=True)):
+        above, below = (np.asarray(forward(x + move, step)[0]) for move in (step, -step))
+        numeric = (above - below) / (2 * steps[i])
+        scale = np.abs(numeric).max() + 1e-9
+        np.testing.assert_allclose(exact[..., i], numeric, atol=1e-5 * scale, err_msg=number)
     for sun_zenith_deg in (0.0, 90.0, 100.0):
         for altitude in (0.0, 0.7):
             there = pack(earth(), sun_zenith_deg, altitude)
