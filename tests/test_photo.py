@@ -110,6 +110,23 @@ def test_what_is_missing_is_asked_for_and_nothing_else(name):
     assert "\n" not in str(caught.value)
 
 
+def test_all_that_is_missing_is_asked_for_at_once():
+    bare = EXIF._replace(focal_length_mm=None, focal_length_35mm_mm=None, time=None, compass_deg=None)
+    flat = image(np.full((HEIGHT, WIDTH, 3), 0.5, np.float32), exif=bare)
+    with pytest.raises(InputError) as caught:
+        photo.complete(flat, {}, True)
+    told = str(caught.value)
+    assert [part.split(":")[0] for part in told.split("; ") if ":" in part] == [
+        "fov_deg",
+        "the sun",
+        "yaw_deg",
+        "pitch_deg",
+    ]
+    assert all(flag in told for flag in ("--fov-deg", TIME_FLAG, "--yaw-deg", "--pitch-deg"))
+    answers = {"fov_deg": 60.0, "time": TIME, "yaw_deg": 10.0, "pitch_deg": 20.0}
+    assert photo.complete(flat, answers, True).options["projection"] == "pinhole"
+
+
 def test_a_picture_without_a_horizon_needs_its_pitch():
     flat = image(np.full((HEIGHT, WIDTH, 3), 0.5, np.float32))
     with pytest.raises(InputError, match=r"^pitch_deg: there is no straight horizon in the picture; give --pitch-deg,"):

@@ -6,7 +6,7 @@ reported.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from diffatmo.cli.common import InputError
@@ -112,8 +112,12 @@ def start(pressure_hpa: float = 1013.25, nodes: Sequence[float] | None = None) -
     )
 
 
+class _Unknown(InputError):
+    """Nothing tells a fact. Those of one photo are told together."""
+
+
 def complete(image: "Image", options: Mapping[str, Any], encoded: bool) -> Photo:
-    """Fill in what ``options`` leave out; raises :class:`InputError` for a fact that nothing tells, naming its option.
+    """Fill in what ``options`` leave out; raises :class:`InputError` for the facts that nothing tells, naming their options.
 
     ``encoded`` is a picture whose transfer function the user has not stated.
     """
@@ -132,16 +136,29 @@ def complete(image: "Image", options: Mapping[str, Any], encoded: bool) -> Photo
             if why:
                 assumed.append(why)
 
+    unknown: list[str] = []
+
+    def find(facts: Callable[..., None], *given: Any) -> None:
+        try:
+            facts(take, said, image.exif, *given)
+        except _Unknown as error:
+            unknown.append(str(error))
+
     height, width = pixels.shape[:2]
     stated = "projection" in said
-    _take_projection(take, said, image.exif, height, width)
+    find(_take_projection, height, width)
     panorama = said["projection"] == "equirectangular"
     if panorama and not stated:
         _check_seam(pixels)
     take("altitude_km", EYE_LEVEL_KM, f"altitude above the ground: {1000 * EYE_LEVEL_KM:g} m")
-    _take_sun(take, said, image.exif, panorama)
+    find(_take_sun, panorama)
     if said["projection"] == "pinhole":
-        _take_pose(take, said, image.exif, pixels)
+        find(_take_heading)
+        find(_take_pitch, pixels)
+        take("pose", "free")
+        take("pose_error_deg", POSE_ERROR_DEG)
+    if unknown:
+        raise InputError("; ".join(unknown))
     if not panorama:
         take("vignetting", "free")
     take("chroma", "free")
@@ -313,7 +330,7 @@ def _take_projection(take: Any, said: dict[str, Any], exif: "Exif", height: int,
         take("focal", "free")
         return
     if exif.focal_length_mm is None:
-        raise InputError(
+        raise _Unknown(
             f"fov_deg: the file does not say; give {flag_of('fov_deg')}, from the top to the bottom of the picture"
         )
     phone = exif.focal_length_mm < PHONE_MM
@@ -354,7 +371,7 @@ def _take_sun(take: Any, said: dict[str, Any], exif: "Exif", panorama: bool) -> 
     elif panorama and not from_user:
         take("sun", "detect", SUN_SEEN)
     else:
-        raise InputError(
+        raise _Unknown(
             f"the sun: the file does not say {' nor '.join(lacks)}; give {' and '.join(options)}, or "
             f"{flag_of('sun_zenith_deg')} and {flag_of('sun_azimuth_deg')}"
         )
@@ -375,12 +392,10 @@ def _sun_at(said: Mapping[str, Any], exif: "Exif") -> str:
     return f"{abs(elevation):.1f}° {side} the horizon at azimuth {angles['sun_azimuth_deg']:.0f}°"
 
 
-def _take_pose(take: Any, said: dict[str, Any], exif: "Exif", pixels: "np.ndarray") -> None:
-    from diffatmo.horizon import find_horizon
-
+def _take_heading(take: Any, said: dict[str, Any], exif: "Exif") -> None:
     if "yaw_deg" not in said:
         if exif.compass_deg is None:
-            raise InputError(
+            raise _Unknown(
                 f"yaw_deg: the file has no compass; give {flag_of('yaw_deg')}, the azimuth of the optical axis"
             )
         kind = "magnetic " if exif.compass_is_magnetic else ""
@@ -390,13 +405,21 @@ def _take_pose(take: Any, said: dict[str, Any], exif: "Exif", pixels: "np.ndarra
             f"azimuth: {exif.compass_deg:g}° ± {HEADING_ERROR_DEG:g}°, by the {kind}compass; fitted",
         )
         take("heading_error_deg", HEADING_ERROR_DEG)
+
+
+def _take_pitch(take: Any, said: dict[str, Any], exif: "Exif", pixels: "np.ndarray") -> None:
+    from diffatmo.horizon import find_horizon
+
+    del exif
     if "pitch_deg" not in said:
         line = find_horizon(pixels)
         if line is None:
-            raise InputError(
+            raise _Unknown(
                 f"pitch_deg: there is no straight horizon in the picture; give {flag_of('pitch_deg')}, the elevation of the "
                 "optical axis"
             )
+        if "fov_deg" not in said:
+            return
         height = len(pixels)
         focal = 0.5 * height / math.tan(math.radians(said["fov_deg"]) / 2)
         roll = -math.degrees(math.atan(line.slope))
@@ -404,8 +427,6 @@ def _take_pose(take: Any, said: dict[str, Any], exif: "Exif", pixels: "np.ndarra
         pitch = math.degrees(math.atan(below / focal))
         take("pitch_deg", pitch, f"elevation of the axis: {pitch:.1f}°, by the horizon in row {line.row:.0f}; fitted")
         take("roll_deg", roll)
-    take("pose", "free")
-    take("pose_error_deg", POSE_ERROR_DEG)
 
 
 def pressure(image: "Image | None") -> tuple[float, float]:
