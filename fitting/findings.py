@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from diffatmo.atmosphere import Atmosphere
 from diffatmo.models import Model
 from fitting._errors import FitError
-from fitting.nuisances import channel_names
+from fitting.nuisances import channel_names, group_of
 from fitting.observation import Observation, sigma
 from fitting.priors import Prior
 from fitting.quantities import numbers
@@ -205,6 +205,23 @@ class Findings:
         """What was added to the light of an image that was fitted, for each channel."""
         names = channel_names(observation, "pedestal", [float(nm) for nm in self.atmosphere.wavelengths])
         return np.array([0.0 if name is None else self.estimate(name).value for name in names])
+
+    def exposure(self, observation: Observation) -> Float[np.ndarray, " w"]:
+        """What the radiance of an image that was fitted was multiplied by, for each channel: exposure and white balance."""
+        wavelengths = [float(nm) for nm in self.atmosphere.wavelengths]
+        factors = [
+            [
+                1.0 if name is None else self.estimate(name).value
+                for name in channel_names(observation, kind, wavelengths)
+            ]
+            for kind in ("exposure", "white_balance")
+        ]
+        return observation.exposure_value * np.prod(factors, axis=0)
+
+    def saturation(self, observation: Observation) -> float:
+        """Coefficient of the purity of its colours; 0 where that is fixed."""
+        group = group_of(observation, "chroma")
+        return 0.0 if group is None else self.estimate(f"chroma_{group}_saturation").value
 
     @property
     def estimates(self) -> list[Estimate]:

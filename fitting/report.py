@@ -38,7 +38,9 @@
                       of the standard error)
 ``minima``            ``chi2`` and ``values`` of each, the best first, if the search found several
 ``images``            for each: place, sun as given, which nuisances are free, how many exposures it was merged
-                      from, masked pixels by reason, pixels that a robust loss takes for outliers, and ``residuals``: per
+                      from, masked pixels by reason, pixels that a robust loss takes for outliers, ``colours`` (of red, green
+                      and blue bands, how light at ``wavelengths_nm`` becomes pixels: ``response``, then ``factor``, then
+                      purity by the coefficient ``saturation``), and ``residuals``: per
                       wavelength the median and the root mean square of measured / fitted - 1, the median of its absolute
                       value, and the root mean square in sigmas
 ``timings``           seconds: ``compile_s``, ``solve_s``, ``total_s``
@@ -61,6 +63,7 @@ from matplotlib.figure import Figure
 
 from diffatmo import atmosphere, folders, imageio, scene, sun
 from diffatmo.atmosphere import Atmosphere
+from diffatmo.bands import COLOURS
 from diffatmo.numerics import array
 from diffatmo.render import Scene
 from fitting._errors import FitError
@@ -313,6 +316,20 @@ def _sun_degrees(observation: Observation) -> tuple[float, float]:
     return math.degrees(zenith), math.degrees(azimuth)
 
 
+def _colours(result: Findings, observation: Observation) -> dict[str, Any] | None:
+    """How the camera saw the light, of an image whose channels are red, green and blue."""
+    bands = observation.bands
+    if bands is None or bands.names != COLOURS:
+        return None
+    return {
+        "wavelengths_nm": bands.nodes,
+        "response": bands.response,
+        "factor": result.exposure(observation),
+        "saturation": result.saturation(observation),
+        "encoded": observation.tone != FIXED,
+    }
+
+
 def _image_record(result: Findings, number: int) -> dict[str, Any]:
     observation = result.observations[number]
     zenith, azimuth = _sun_degrees(observation)
@@ -325,6 +342,7 @@ def _image_record(result: Findings, number: int) -> dict[str, Any]:
         "sun_azimuth_deg": azimuth,
         **{kind: getattr(observation, kind) for kind in KINDS},
         "exposure_value": observation.exposure_value,
+        "colours": _colours(result, observation),
         "merged_from": observation.merged,
         "pixels_used": len(relative),
         "pixels_masked": observation.masked,

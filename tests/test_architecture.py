@@ -68,7 +68,7 @@ LEVELS = [
     ["fitting"],
     ["diffatmo"],  # the lazy public interface
     ["diffatmo.cli", "diffatmo.cli.cache", "diffatmo.cli.common", "diffatmo.cli.workers"],
-    ["diffatmo.cli.keys", "diffatmo.cli.shipped", "diffatmo.cli.results"],
+    ["diffatmo.cli.keys", "diffatmo.cli.shipped", "diffatmo.cli.results", "diffatmo.cli.colours"],
     ["diffatmo.cli.scenefile"],
     ["diffatmo.cli.photo", "diffatmo.cli.bracket"],
     ["diffatmo.cli.scans"],

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from diffatmo.cli import colours as camera_colours
 from diffatmo.cli import keys
 from diffatmo.cli.common import (
     InputError,
@@ -51,6 +52,12 @@ SIZE = click.IntRange(1, 16384)
 @keys.options(PLACE_KEYS, DEFAULTS)
 @keys.options(EXPOSURE)
 @click.option("--sun-disc", is_flag=True, help="Draw the disc of the sun.")
+@click.option(
+    "--colours",
+    metavar="FIT.json",
+    type=click.Path(path_type=Path),
+    help="In the exposure and colours of the photo that was fitted there; ATM.toml is that fit's atmosphere.toml.",
+)
 @overwrite_option
 def render(
     atmosphere: str,
@@ -61,13 +68,15 @@ def render(
     width: int | None,
     height: int | None,
     sun_disc: bool,
+    colours: Path | None,
     overwrite: bool,
     **values: Any,
 ) -> None:
     """Render a picture of the sky.
 
     ATM.toml is an atmosphere file or the name of a preset. An EXR holds linear radiance at every wavelength and, in its
-    header, everything that it was made from; a PNG is developed for the screen.
+    header, everything that it was made from; a PNG is developed for the screen. With --colours both have the photo's three
+    channels, and an EXR no header.
     """
     given = keys.given(CAMERA_KEYS | PLACE_KEYS | EXPOSURE, values)
     options: dict[str, Any] = DEFAULTS | keys.with_sun(given)
@@ -82,8 +91,13 @@ def render(
 
     chosen = make_model(model, samples=samples, seed=seed)
     air = read_atmosphere(atmosphere)
+    seen = None if colours is None else camera_colours.read(colours, air)
     scene = make_scene(air, options, width, height)
     pixels = np.asarray(outermost(render.render)(scene, chosen, sun_disc=sun_disc))
+    if seen is not None:
+        for path in outputs:
+            _write_seen(path, seen.develop(pixels), encoded=seen.encoded, automatic="exposure" not in given)
+        return
     for path, write in writers:
         write(path, pixels, scene, {"model": model, "sun_disc": sun_disc}, "exposure" not in given)
 
@@ -114,6 +128,22 @@ def _writer(path: Path) -> Callable[..., None]:
     if path.suffix.lower() not in writers:
         raise InputError(f"{path}: expected a name that ends in .exr or .png")
     return writers[path.suffix.lower()]
+
+
+def _write_seen(path: Path, rgb: "np.ndarray", *, encoded: bool, automatic: bool) -> None:
+    """A picture in a photo's own channels, which are about those of sRGB."""
+    import jax.numpy as jnp
+    import numpy as np
+
+    from diffatmo import color, imageio
+
+    if path.suffix.lower() == ".exr":
+        imageio.write_exr(path, rgb, overwrite=True)
+    elif encoded:
+        imageio.write_png(path, np.asarray(color.srgb_encode(jnp.clip(jnp.asarray(rgb), 0, 1))), overwrite=True)
+    else:
+        exposure = color.auto_exposure(jnp.asarray(rgb)) if automatic else 1.0
+        imageio.write_png(path, np.asarray(color.encode(jnp.asarray(rgb), exposure=exposure)), overwrite=True)
 
 
 def _write_exr(path: Path, pixels: "np.ndarray", scene: "Scene", notes: dict[str, Any], automatic: bool) -> None:
