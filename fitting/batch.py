@@ -119,7 +119,9 @@ def stack(observations: Sequence[Observation], wavelengths: Sequence[float], mes
         _check_channels(observation, observations[0], wavelengths)
     most, devices = max(int(observation.shown.sum()) for observation in observations), 1 if mesh is None else mesh.size
     tiles = math.ceil(most / (devices * TILE))
-    size = devices * tiles * math.ceil(most / (devices * tiles))
+    each = math.ceil(most / (devices * tiles))
+    # Among several devices, some would have nothing but what is added.
+    size = devices * tiles * (rounded(each) if devices == 1 else each)
 
     def padded(field: str | Sequence[np.ndarray], fill: Any) -> Array:
         rows = []
@@ -167,6 +169,18 @@ def stack(observations: Sequence[Observation], wavelengths: Sequence[float], mes
         tiles=tiles,
         mesh=mesh,
     )
+
+
+def rounded(count: int) -> int:
+    """The next of 2, 8, 32, 128, 512, 2048, beyond that of four sizes to an octave.
+
+    A program is for one size of its arrays. The next photo has other clouds and another number of pixels; that its fit needs no
+    other program spares far more than pixels cost that are not used: the sky is solved whatever their number.
+    """
+    if count <= 2048:
+        return next(size for size in (2, 8, 32, 128, 512, 2048) if size >= count)
+    step = 1 << (count - 1).bit_length() - 3
+    return -(-count // step) * step
 
 
 def _check_channels(observation: Observation, first: Observation, wavelengths: Sequence[float]) -> None:

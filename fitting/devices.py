@@ -2,6 +2,9 @@
 
 Everything but the pixels is on every device, and every process takes the same steps: what they exchange are a few rows for each
 evaluation, and the radiance of all pixels.
+
+On CPUs a process should have one device, which uses all cores: where ``--xla_force_host_platform_device_count`` gives each
+of several processes as many devices as there are cores, XLA's threads can wait for each other for ever.
 """
 
 from collections.abc import Sequence

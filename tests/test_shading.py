@@ -23,7 +23,7 @@ from fitting.batch import stack
 from fitting.least_squares import reduce_images
 from fitting.linearisation import linearise
 from fitting.nuisances import assumed, gather, shading
-from fitting.observation import sigma
+from fitting.observation import sigma, unstack
 from fitting.parameters import select
 from fitting.problem import Problem
 
@@ -245,8 +245,8 @@ def test_a_tone_of_the_first_kind_is_another_gamma(x64):
     )
     image = picture(pixels, noise=1e-9, saturation=white, tone="free")
     ours = problem([dataclasses.replace(image, image=(white * (pixels / white) ** 1.25))], toy_sky.truth(), ["mie_g"])
-    changed = light() * np.asarray(ours.batch.modulation(jnp.array([[t, 0.0, 0.0]]))).reshape(pixels.shape)
-    np.testing.assert_allclose(changed, white * (pixels / white) ** 1.25, rtol=1e-6)
+    factor = unstack(image, np.asarray(ours.batch.modulation(jnp.array([[t, 0.0, 0.0]])))[0])
+    np.testing.assert_allclose(light() * factor, white * (pixels / white) ** 1.25, rtol=1e-6)
 
 
 # Names and choices --------------------------------------------------------------------------------------------------
@@ -277,12 +277,9 @@ def test_groups_share():
     modulation = np.asarray(batch.modulation(moved))
     rho = images[0].radius[..., None]
     lens = np.exp(0.5 * (rho**2 + rho**4))
-    third, colour = (
-        modulation[2].reshape((*lens.shape[:2], 3)),
-        np.exp(0.2 * shading(images[0], "chroma", "saturation")),
-    )
+    third, colour = unstack(images[2], modulation[2]), np.exp(0.2 * shading(images[0], "chroma", "saturation"))
     np.testing.assert_allclose(third, np.exp(0.2 * shading(images[2], "chroma", "saturation")), rtol=1e-5)
-    np.testing.assert_allclose(modulation[0].reshape(third.shape), lens * colour, rtol=1e-5)
+    np.testing.assert_allclose(unstack(images[0], modulation[0]), lens * colour, rtol=1e-5)
 
 
 def test_a_compass_has_an_error_of_its_own():
