@@ -118,28 +118,42 @@ def test_radiance_and_irradiance_are_those_of_brunetons_program(reference, s1, o
     np.testing.assert_allclose(sky.sky_irradiance(altitude=altitude, mu_s=mu_s), truth["sky_irradiance"], rtol=2e-3)
 
 
+@eqx.filter_jit
+def places(planet):
+    """Positions of the nodes of every axis, and what of T and of S may not be compared; compiled as a whole."""
+    altitude, mu = planet.transmittance_nodes()
+    free = mu > -jnp.sqrt(1 - (planet.bottom_radius / (planet.bottom_radius + altitude[:, None])) ** 2) + 1e-9
+    of_t = planet.transmittance_position(jnp.broadcast_to(altitude[:, None], mu.shape), mu)
+    altitude, mu_s = planet.irradiance_nodes()
+    of_e = planet.irradiance_position(altitude[:, None], mu_s)
+    of_s = (
+        planet.altitude_position(planet.altitudes()),
+        planet.mu_s_position(planet.mu_s_nodes()),
+        planet.nu_position(planet.nu_nodes()),
+    )
+
+    def of_mu(altitude):
+        mu = planet.mu_nodes(altitude)
+        return mu, planet.mu_position(jnp.broadcast_to(altitude, mu.shape), mu, planet.ground_nodes())
+
+    return of_t, free, of_e, of_s, jax.lax.map(of_mu, planet.altitudes()[1:-1])
+
+
 @pytest.mark.parametrize("parameterisation", PARAMETERISATIONS)
 @pytest.mark.parametrize(("radius", "top"), [(6360.0, 100.0), (60.0, 8.0)])
 def test_every_entry_is_found_where_it_was_put(x64, parameterisation, radius, top):
     """Position(node i) = i on every axis; in 2008 the first entries of a half of mu may lie beyond the nearest boundary."""
     sizes = Sizes(7, 9, 5, 6, 8, 10, 11, 4)
     planet = Planet(jnp.asarray(radius), jnp.asarray(top), -0.2, sizes, parameterisation)
-    altitude, mu = planet.transmittance_nodes()
+    (p_r, p_mu), free, (p_h, p_s), of_s, (mus, positions) = jax.tree.map(np.asarray, places(planet))
     # At the top and straight up every distance is the same.
-    p_r, p_mu = planet.transmittance_position(jnp.broadcast_to(altitude[:, None], mu.shape), mu)
-    np.testing.assert_allclose(p_r, np.broadcast_to(np.arange(7)[:, None], mu.shape), atol=1e-6)
-    free = mu > -jnp.sqrt(1 - (radius / (radius + altitude[:, None])) ** 2) + 1e-9
-    np.testing.assert_allclose(p_mu[free], np.broadcast_to(np.arange(9), mu.shape)[free], atol=1e-5)
-    altitude, mu_s = planet.irradiance_nodes()
-    p_r, p_s = planet.irradiance_position(altitude[:, None], mu_s)
-    np.testing.assert_allclose(p_r[:, 0], np.arange(5), atol=1e-9)
+    np.testing.assert_allclose(p_r, np.broadcast_to(np.arange(7)[:, None], p_r.shape), atol=1e-6)
+    np.testing.assert_allclose(p_mu[free], np.broadcast_to(np.arange(9), p_mu.shape)[free], atol=1e-5)
+    np.testing.assert_allclose(p_h[:, 0], np.arange(5), atol=1e-9)
     np.testing.assert_allclose(p_s, np.arange(6), atol=1e-9)
-    np.testing.assert_allclose(planet.altitude_position(planet.altitudes()), np.arange(8), atol=1e-9)
-    np.testing.assert_allclose(planet.mu_s_position(planet.mu_s_nodes()), np.arange(11), atol=1e-9)
-    np.testing.assert_allclose(planet.nu_position(planet.nu_nodes()), np.arange(4), atol=1e-9)
-    for altitude in planet.altitudes()[1:-1]:
-        mu = planet.mu_nodes(altitude)
-        found = np.asarray(planet.mu_position(jnp.broadcast_to(altitude, mu.shape), mu, planet.ground_nodes()))
+    for found, count in zip(of_s, (8, 11, 4), strict=True):
+        np.testing.assert_allclose(found, np.arange(count), atol=1e-9)
+    for mu, found in zip(mus, positions, strict=True):
         inside = np.abs(mu) < 1 - 1e-9
         np.testing.assert_allclose(found[inside], np.arange(10)[inside], atol=1e-5)
 
@@ -148,9 +162,11 @@ def test_a_lookup_at_an_entry_is_that_entry():
     """Multilinear interpolation reproduces a table at its nodes, and a table of a linear function everywhere."""
     planet = Planet(jnp.asarray(6360.0), jnp.asarray(100.0), -0.2, Sizes(4, 4, 4, 4, 5, 6, 7, 4), "2017")
     table = jax.random.uniform(jax.random.key(0), (5, 6, 4, 7, 2))
-    altitude = planet.altitudes()[2]
-    mu, mu_s, nu = planet.mu_nodes(altitude), planet.mu_s_nodes(), planet.nu_nodes()
-    got = look_up(planet, table, altitude, mu[:, None, None], mu_s, nu[:, None], planet.ground_nodes()[:, None, None])
+    altitude, mu, mu_s, nu = eqx.filter_jit(
+        lambda p: (p.altitudes()[2], p.mu_nodes(p.altitudes()[2]), p.mu_s_nodes(), p.nu_nodes())
+    )(planet)
+    ground = planet.ground_nodes()[:, None, None]
+    got = eqx.filter_jit(look_up)(planet, table, altitude, mu[:, None, None], mu_s, nu[:, None], ground)
     np.testing.assert_allclose(got, table[2], atol=2e-4)
     x, y = jnp.array([0.0, 0.3, 2.9]), jnp.array([1.0, 1.7, 4.0])
     plane = jnp.arange(4.0)[:, None] * 10 + jnp.arange(5.0)

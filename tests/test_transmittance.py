@@ -9,6 +9,11 @@ import pytest
 from diffatmo import geometry, rays, transmittance
 from diffatmo.atmosphere import earth
 
+# Compiled as a whole: one operation after another, each is a program of its own.
+to_top, to_sun = jax.jit(transmittance.to_top), jax.jit(transmittance.to_sun)
+trace, columns_along = (jax.jit(f, static_argnums=n) for f, n in ((rays.trace, 5), (transmittance.columns_along, 4)))
+densities = jax.jit(lambda a, h: [jnp.mean(f(h)) for f in (a.rayleigh_density, a.mie_density, a.ozone_density)])
+
 
 def planet(radius, thickness):
     where = lambda a: (a.bottom_radius, a.top_radius)
@@ -20,14 +25,13 @@ def brute(atmosphere, h, mu, length, steps=40000):
     d = (np.arange(steps) + 0.5) / steps * length
     r = float(atmosphere.bottom_radius) + h
     altitude = np.sqrt(r * r + 2 * r * mu * d + d * d) - float(atmosphere.bottom_radius)
-    profiles = (atmosphere.rayleigh_density, atmosphere.mie_density, atmosphere.ozone_density)
-    return np.array([float(jnp.sum(p(jnp.asarray(altitude)))) * length / steps for p in profiles])
+    return length * np.array(densities(atmosphere, altitude))
 
 
 def of_constituents(atmosphere, columns):
     """Columns of air, aerosol and absorber, km."""
     _, factors = transmittance.edges(atmosphere)
-    return np.concatenate([columns.exponential, jnp.tensordot(factors, columns.ramps, axes=1)[None]])
+    return np.concatenate([columns.exponential, np.tensordot(factors, columns.ramps, axes=1)[None]])
 
 
 @pytest.mark.parametrize(("radius", "thickness"), [(6360.0, 100.0), (1000.0, 60.0)])
@@ -38,8 +42,8 @@ def of_constituents(atmosphere, columns):
 def test_columns_to_the_top(x64, radius, thickness, h, mu):
     """Chapman's function is good to (H/R)², 2e-6 on Earth and 6e-5 on the small planet."""
     atmosphere = planet(radius, thickness)
-    at = jnp.asarray(h), jnp.asarray(mu)
-    columns, free = transmittance.to_top(atmosphere, *at)
+    at = np.asarray(h), np.asarray(mu)
+    columns, free = to_top(atmosphere, *at)
     assert bool(free)
     length = float(geometry.distance_up(*at, atmosphere.top_altitude, atmosphere.bottom_radius))
     want = brute(atmosphere, h, mu, length)
@@ -48,9 +52,9 @@ def test_columns_to_the_top(x64, radius, thickness, h, mu):
     )
     # The same by quadrature along the ray, which knows nothing of Chapman's function. On the small planet the map's
     # stretch, 9 km, is hardly above the scale height and the integrand no polynomial any more.
-    nodes = rays.trace(*at, jnp.asarray(False), atmosphere.bottom_radius, atmosphere.top_altitude, 12)
+    nodes = trace(*at, np.asarray(False), atmosphere.bottom_radius, atmosphere.top_altitude, 12)
     np.testing.assert_allclose(
-        of_constituents(atmosphere, transmittance.columns_along(atmosphere, *at, nodes, 12)[1]),
+        of_constituents(atmosphere, columns_along(atmosphere, *at, nodes, 12)[1]),
         want,
         rtol=1e-4,
         atol=1e-5,
@@ -59,11 +63,11 @@ def test_columns_to_the_top(x64, radius, thickness, h, mu):
 
 def test_columns_along_a_ray_to_the_ground(x64):
     atmosphere = earth()
-    at = jnp.asarray(12.0), jnp.asarray(-0.3)
-    nodes = rays.trace(*at, jnp.asarray(True), atmosphere.bottom_radius, atmosphere.top_altitude, 12)
-    here, end = transmittance.columns_along(atmosphere, *at, nodes, 12)
+    at = np.asarray(12.0), np.asarray(-0.3)
+    nodes = trace(*at, np.asarray(True), atmosphere.bottom_radius, atmosphere.top_altitude, 12)
+    here, end = columns_along(atmosphere, *at, nodes, 12)
     length = float(geometry.distance_down(*at, jnp.zeros(()), atmosphere.bottom_radius))
-    assert float(jnp.sum(nodes.weight)) == pytest.approx(length, rel=1e-9)
+    assert float(np.sum(nodes.weight)) == pytest.approx(length, rel=1e-9)
     np.testing.assert_allclose(
         of_constituents(atmosphere, end), brute(atmosphere, 12.0, -0.3, length), rtol=1e-5, atol=1e-6
     )
@@ -74,17 +78,17 @@ def test_columns_along_a_ray_to_the_ground(x64):
 
 def test_float32_agrees_with_float64():
     h, mu = np.meshgrid([0.0, 0.001, 1.0, 20.0], [0.0, 0.001, 0.1, 1.0])
-    single = transmittance.to_sun(earth(), jnp.asarray(h, jnp.float32), jnp.asarray(mu, jnp.float32))
+    single = to_sun(earth(), h.astype(np.float32), mu.astype(np.float32))
     with jax.enable_x64(True):
-        double = transmittance.to_sun(earth(), jnp.asarray(h), jnp.asarray(mu))
+        double = to_sun(earth(), h, mu)
     np.testing.assert_allclose(single, double, atol=5e-6)
 
 
 def test_there_is_no_sun_in_the_shadow():
-    h = jnp.array([0.0, 1.0, 10.0])
-    horizon = geometry.horizon_mu(h, earth().bottom_radius)
-    assert float(transmittance.to_sun(earth(), h, horizon - 1e-4).max()) == 0
-    assert float(transmittance.to_sun(earth(), h[2:], horizon[2:] + 1e-4).min()) > 0
+    h = np.array([0.0, 1.0, 10.0], np.float32)
+    horizon = np.asarray(geometry.horizon_mu(h, earth().bottom_radius))
+    assert to_sun(earth(), h, horizon - 1e-4).max() == 0
+    assert to_sun(earth(), h, horizon + 1e-4)[2:].min() > 0
 
 
 def test_shadow_crossing_lies_on_the_edge(x64):
@@ -100,17 +104,19 @@ def test_shadow_crossing_lies_on_the_edge(x64):
     assert float(max(rays.shadow_crossings(h, mu, jnp.asarray(0.9), nu, radius))) < 0
 
 
+survives = jax.jit(lambda x: jnp.sum(transmittance.to_sun(earth(), x[0], x[1])))
+slope = jax.jit(jax.grad(survives))
+
+
 @pytest.mark.parametrize("mu", [-1.0, -0.02, 0.0, 0.02, 1.0])
 @pytest.mark.parametrize("h", [0.0, 0.1, 100.0])
 def test_derivatives_are_finite_and_right(x64, h, mu):
     """Ordinary points agree with central differences to 1e-5; special ones are finite."""
-    f = lambda x: jnp.sum(transmittance.to_sun(earth(), x[0], x[1]))
-    x = jnp.array([h, mu])
-    exact = jax.grad(f)(x)
-    assert jnp.isfinite(exact).all()
+    x = np.array([h, mu])
+    exact = slope(x)
+    assert np.isfinite(exact).all()
     if h == 0.1 and mu == 0.02:
-        step = 1e-5
-        numeric = [(f(x.at[i].add(step)) - f(x.at[i].add(-step))) / (2 * step) for i in (0, 1)]
+        numeric = [(survives(x + step) - survives(x - step)) / 2e-5 for step in 1e-5 * np.eye(2)]
         np.testing.assert_allclose(exact, numeric, rtol=1e-5)
 
 
@@ -120,7 +126,8 @@ def test_derivatives_at_the_top_along_a_ray_that_is_horizontal_but_for_rounding(
     def columns(altitude, mu):
         return transmittance.to_top(earth(), altitude, mu)[0]
 
-    at = jnp.float32(100.0), jnp.float32(1e-25)
-    np.testing.assert_allclose(columns(*at).exponential, 0, atol=1e-4)
+    at = np.float32(100.0), np.float32(1e-25)
+    np.testing.assert_allclose(jax.jit(columns)(*at).exponential, 0, atol=1e-4)
     for derivative in (jax.jacfwd, jax.jacrev):
-        assert all(jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(derivative(columns, argnums=(0, 1))(*at)))
+        slopes = jax.jit(derivative(columns, argnums=(0, 1)))(*at)
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slopes))
