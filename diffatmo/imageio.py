@@ -80,6 +80,8 @@ class Image(NamedTuple):
     """Relative standard deviation of every value, where it is known: of merged exposures."""
     turned: int = 1
     """Exif's orientation of the stored picture, which ``pixels`` are turned by."""
+    taken_as_linear: bool = False
+    """Whether neither the file nor the caller says so: of integers of 16 bits."""
 
 
 def read_image(path: str | Path, *, transfer: str | None = None) -> Image:
@@ -160,7 +162,8 @@ def _linear(codes: np.ndarray, transfer: str | None, said: str | None, notes: Ex
     values = np.empty(codes.shape, np.float32)
     for row, light in zip(codes, values, strict=True):
         light[:] = table[row]
-    return Image(values, {}, None, notes, saturation=1.0, turned=turned)
+    silent = transfer is None and said is None
+    return Image(values, {}, None, notes, saturation=1.0, turned=turned, taken_as_linear=silent)
 
 
 def _light(values: np.ndarray, transfer: str | None) -> np.ndarray:

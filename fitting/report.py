@@ -81,7 +81,7 @@ from fitting.figures import (
     residual_scale,
 )
 from fitting.findings import NINETY_FIVE, ONE_SIGMA, Estimate, Findings
-from fitting.nuisances import KINDS, group_of
+from fitting.nuisances import KINDS
 from fitting.observation import FIXED, PER_CHANNEL, Observation
 from fitting.storage import installed_version
 from fitting.tables import (
@@ -217,14 +217,12 @@ def scene_of(result: Findings, observation: Observation) -> Scene | None:
     several = observation.block > 1 or observation.exposure.endswith(PER_CHANNEL) or observation.bands is not None
     if several or others != {FIXED}:
         return None
-    group = group_of(observation, "exposure")
-    factor = 1.0 if group is None else result.estimate(f"exposure_{group}").value
     return Scene(
         atmosphere=result.atmosphere,
         camera=observation.camera,
         altitude=array(observation.altitude),
         sun=array(observation.sun),
-        exposure=array(observation.exposure_value * factor),
+        exposure=array(float(result.exposure(observation)[0])),
     )
 
 

@@ -305,7 +305,7 @@ def test_fit_of_a_scene_file(tmp_path, s1, start, toy):
             for z in (40, 80)
         )
     )
-    assert main(["fit", "--config", str(folder / "scene.toml"), "-o", str(tmp_path / "out")]) == 0
+    assert main(["fit", str(folder / "scene.toml"), "-o", str(tmp_path / "out")]) == 0
     record = json.loads((tmp_path / "out" / "fit.json").read_text())
     assert list(record["nuisances"]) == ["exposure_camera"]
     ratio = np.divide(record["parameters"]["rayleigh_scattering"]["value"], s1.rayleigh_scattering)

@@ -240,7 +240,15 @@ def test_16_bits_that_say_they_are_linear(tmp_path):
     codes = RNG.integers(0, 65536, (4, 5, 3), dtype=np.uint16)
     for extra in (png_chunk(b"gAMA", struct.pack(">I", 100000)), png_chunk(b"cICP", bytes([1, 8, 0, 1]))):
         (tmp_path / "a.png").write_bytes(png_file(codes, extra=extra))
-        np.testing.assert_allclose(imageio.read_image(tmp_path / "a.png").pixels, codes / 65535, atol=1e-7)
+        found = imageio.read_image(tmp_path / "a.png")
+        np.testing.assert_allclose(found.pixels, codes / 65535, atol=1e-7)
+        assert not found.taken_as_linear
+
+
+def test_16_bits_that_say_nothing_are_known_to_be_taken_as_linear(tmp_path):
+    (tmp_path / "a.png").write_bytes(png_file(RNG.integers(0, 65536, (4, 5, 3), dtype=np.uint16)))
+    assert imageio.read_image(tmp_path / "a.png").taken_as_linear
+    assert not imageio.read_image(tmp_path / "a.png", transfer="linear").taken_as_linear
 
 
 # --- TIFF

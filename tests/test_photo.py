@@ -127,6 +127,13 @@ def test_all_that_is_missing_is_asked_for_at_once():
     assert photo.complete(flat, answers, True).options["projection"] == "pinhole"
 
 
+def test_what_is_taken_as_linear_is_said_to_be():
+    """Sixteen bits a channel that say nothing of a transfer function; an editor may have left them encoded."""
+    silent = image()._replace(taken_as_linear=True)
+    assert any("--transfer srgb" in line for line in photo.complete(silent, {}, False).assumed)
+    assert not any("--transfer srgb" in line for line in photo.complete(image(), {}, False).assumed)
+
+
 def test_a_picture_without_a_horizon_needs_its_pitch():
     flat = image(np.full((HEIGHT, WIDTH, 3), 0.5, np.float32))
     with pytest.raises(InputError, match=r"^pitch_deg: there is no straight horizon in the picture; give --pitch-deg,"):

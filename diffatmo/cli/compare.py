@@ -111,7 +111,7 @@ def compare(
             path, notes = output / f"picture_{name}.exr", {"model": name}
             scenes.save(path, outcomes[name].picture, scene, notes=notes, overwrite=True)
     found = {name: comparison.errors(scene, outcome, outcomes[truth]) for name, outcome in outcomes.items()}
-    _write(output, scene, outcomes, found, truth)
+    _write(output, scene, outcomes, found, truth, samples)
     console.print(_table(outcomes, found, truth))
     console.print(f"Pictures and report: {output / 'compare.html'}", soft_wrap=True)
 
@@ -193,7 +193,12 @@ def _sheet(scene: "Scene", outcomes: "dict[str, Outcome]", truth: str) -> "Figur
 
 
 def _write(
-    directory: Path, scene: "Scene", outcomes: "dict[str, Outcome]", found: "dict[str, Errors]", truth: str
+    directory: Path,
+    scene: "Scene",
+    outcomes: "dict[str, Outcome]",
+    found: "dict[str, Errors]",
+    truth: str,
+    samples: int,
 ) -> None:
     import html
     import json
@@ -221,6 +226,7 @@ def _write(
         "schema_version": SCHEMA_VERSION,
         "diffatmo": __version__,
         "truth": truth,
+        "samples": samples if "pathtrace" in outcomes else None,
         "scene": scenes.dumps(scene),
         "models": {
             name: known(

@@ -15,7 +15,12 @@ from diffatmo.cli.scenefile import FREE, IMAGE_KEYS, LOSSES, MODELS, FitSpec, br
 
 @click.command()
 @click.argument("images", metavar="[IMAGE|FOLDER]...", nargs=-1, type=click.Path(path_type=Path))
-@click.option("--config", metavar="SCENE.toml", type=click.Path(path_type=Path), help="Scene file, instead of images.")
+@click.option(
+    "--config",
+    metavar="SCENE.toml",
+    type=click.Path(path_type=Path),
+    help="Scene file, instead of images; SCENE.toml alone says the same.",
+)
 @click.option(
     "--init",
     metavar="ATM.toml",
@@ -230,6 +235,8 @@ def plan(
     bracketed: bool = False,
 ) -> dict[Path, FitSpec]:
     """What to fit, by the directory its results go to."""
+    if len(images) == 1 and images[0].suffix.lower() == ".toml" and not config:
+        images, config = (), images[0]
     if images and config:
         raise InputError("IMAGE and --config contradict each other: the scene file names the images")
     if options and not images:
@@ -238,7 +245,7 @@ def plan(
     if images:
         for image in images:
             if image.suffix.lower() == ".toml":
-                raise InputError(f"{image}: not an image; a scene file goes with --config, an atmosphere with --init")
+                raise InputError(f"{image}: not an image; a scene file goes alone, an atmosphere with --init")
         check_image_options(options, complete=False)
         views = [images] if bracketed else [[image] for image in images]
         return {output: FitSpec(tuple(bracket(files, options) for files in views))}

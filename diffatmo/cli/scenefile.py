@@ -199,6 +199,8 @@ def read_scene(path: Path, *, least: int = 1) -> FitSpec:
 
 
 def _scene(data: Mapping[str, Any], directory: Path, least: int) -> FitSpec:
+    if "wavelengths_nm" in data:
+        raise InputError("an atmosphere, expected a scene file; the atmosphere where a fit starts goes with --init")
     _refuse_unknown(data, SCENE_KEYS)
     tables = data.get("image", [])
     if not isinstance(tables, list) or not all(isinstance(table, dict) for table in tables):
