@@ -236,7 +236,7 @@ def plan(
 ) -> dict[Path, FitSpec]:
     """What to fit, by the directory its results go to."""
     if len(images) == 1 and images[0].suffix.lower() == ".toml" and not config:
-        images, config = (), images[0]
+        return plan((), images[0], options, output)
     if images and config:
         raise InputError("IMAGE and --config contradict each other: the scene file names the images")
     if options and not images:
