@@ -259,7 +259,10 @@ CASES = {
     "time and detection": (["fit", "GOOD.exr", *HERE, "--sun", "detect"], '"detect" contradicts time'),
     "at night": (["fit", "GOOD.exr", *HERE[:3], "0", "--longitude-deg", "-150"], "degrees below the horizon"),
     "scene as an image": (["fit", "GOOD.exr", "GOOD.toml"], "a scene file goes alone, an atmosphere with --init"),
-    "atmosphere as a scene": (["fit", "GOOD.toml"], "an atmosphere, expected a scene file"),
+    "atmosphere as a scene": (
+        ["fit", "GOOD.toml"],
+        "an atmosphere, expected a scene file, which names an atmosphere under init",
+    ),
     "scan with a mask": (["fit", "GOOD.csv", "--mask", "GOOD.exr"], "mask: "),
     "scan with a camera": (["fit", "GOOD.csv", "--projection", "fisheye"], "which says itself where it looks"),
     "image and scene": (["fit", "GOOD.exr", "--config", "NOISE.scene"], "contradict"),

@@ -44,6 +44,21 @@ def test_purity_is_that_of_the_fit(record):
     assert np.all(colours.read(record(SEEN), start(1013.0)).develop(0 * radiance) == 0)
 
 
+@pytest.mark.parametrize("saturation", [-0.4, 0.1, 0.33, 0.6])
+def test_a_channel_that_fades_does_not_break_off(record, saturation):
+    """The deep orange of a low sun: blue falls evenly to nothing, and so it does in the picture."""
+    seen = SEEN | {"response": np.eye(3).tolist(), "wavelengths_nm": list(bands.NODES[:3]), "saturation": saturation}
+    photo = colours.Colours(
+        *(np.asarray(seen[key]) for key in ("wavelengths_nm", "response")), np.ones(3), saturation, True
+    )
+    blue = np.geomspace(1, 1e-4, 2000)
+    pixel = photo.develop(np.stack([1 + 0 * blue, 0.7 + 0 * blue, blue], -1)).astype(float)
+    fall = np.diff(np.log(pixel[:, 2])) / np.diff(np.log(blue))
+    # Its slope is 1 / (1 - s Y / pixel): at most 5 with `STEEPEST`, less than 1 where colours are made paler.
+    assert fall.max() < 5.2
+    assert fall.min() > 0
+
+
 def test_the_first_photo_counts(record):
     other = SEEN | {"factor": [9.0, 9.0, 9.0]}
     assert colours.read(record(None, SEEN, other), start(1013.0)).factor.tolist() == SEEN["factor"]

@@ -8,13 +8,19 @@ from pathlib import Path
 VARIABLE = "JAX_COMPILATION_CACHE_DIR"
 """Read by JAX when it is imported. A user who has set it, also to nothing, is not overruled."""
 
+SHORTEST = "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"
+"""From how many seconds on a program is kept: by default one, but a photo needs a hundred small ones, five seconds in all."""
+
 
 def enable() -> None:
     """Tell JAX where to keep what it compiles; where nothing can be kept, nothing changes.
 
     JAX files a program under all that it depends on: its code, the version of the compiler, the kind of processor.
     """
-    if VARIABLE in os.environ or "jax" in sys.modules:
+    if "jax" in sys.modules:
+        return
+    os.environ.setdefault(SHORTEST, "0")
+    if VARIABLE in os.environ:
         return
     try:
         directory = _caches() / "diffatmo"

@@ -14,8 +14,12 @@ if TYPE_CHECKING:
 SAME_NM = 0.5
 """Between a wavelength of the fit and one of the atmosphere."""
 
-STEPS = 30
-"""Of the iteration for the purity, which at least halves the error each time."""
+STEPS = 60
+"""Of the iteration for the purity, each of which leaves 0.8 of the error at most."""
+
+STEEPEST = 0.8
+"""Luminance over a channel, times the coefficient, up to which purity grows: from 1 on there is no such pixel, and just below,
+light a little less would make the pixel very much darker."""
 
 
 class Colours(NamedTuple):
@@ -38,12 +42,17 @@ class Colours(NamedTuple):
 
         from diffatmo.color import LUMINANCE
 
-        light = np.maximum(radiance @ self.response.T * self.factor, 0)
-        pixel = light
-        for _ in range(STEPS if self.saturation else 0):
-            share = (pixel @ np.asarray(LUMINANCE))[..., None] / np.maximum(pixel, 1e-30)
-            pixel = light * np.exp(self.saturation * (1 - np.minimum(share, 10)))
-        return np.asarray(pixel, dtype=np.float32)
+        light = np.maximum(radiance @ self.response.T * self.factor, 0).astype(float)
+        lit, s = light > 0, self.saturation
+        wanted = np.log(np.where(lit, light, 1))
+        found, largest = wanted, STEEPEST / s if s > 0 else np.inf
+        for _ in range(STEPS if s else 0):
+            luminance = np.where(lit, np.exp(found), 0) @ np.asarray(LUMINANCE, float)
+            share = luminance[..., None] * np.exp(-found)
+            off = found - wanted - s * (1 - np.minimum(share, largest))
+            # Newton's step where colours are made paler; where they are made purer the slope is between 0.2 and 1.
+            found = found - off / (1 + max(-s, 0) * share)
+        return np.where(lit, np.exp(found), 0).astype(np.float32)
 
 
 def read(path: Path, air: "Atmosphere") -> Colours:

@@ -165,7 +165,9 @@ def complete(image: "Image", options: Mapping[str, Any], encoded: bool) -> Photo
     if encoded:
         take("tone", "free", "transfer function: about that of sRGB; a smooth tone curve is fitted besides")
     elif image.taken_as_linear:
-        assumed.append("transfer function: none, the file does not say; if it is like that of sRGB, --transfer srgb")
+        assumed.append(
+            "transfer function: taken as linear, as the file does not say; if it was developed for a screen, --transfer srgb"
+        )
     if image.saturation is not None:
         take("saturation", SATURATION * image.saturation)
     if "white_balance" not in said:

@@ -82,7 +82,7 @@ IMAGE_KEYS: dict[str, Key] = {
     "sun_exclusion_deg": Number("Leave out pixels nearer to the sun.  [default: 2]", 0, 179),
     "horizon_exclusion_deg": Number("Leave out pixels nearer to the horizon.  [default: 0]", 0, 89),
     "mask": Word("A picture that is black where pixels are to be left out."),
-    "transfer": Word("Transfer function of an 8-bit picture.", ("srgb", "linear")),
+    "transfer": Word("Transfer function of a picture that is not linear.", ("srgb", "linear")),
     "exposure_s": Numbers(
         "Of a bracket: how long each file was exposed, in s.  [default: from Exif, with ISO and f-number]",
         "numbers above 0, one for each file, like 0.001, 0.008",
@@ -200,7 +200,7 @@ def read_scene(path: Path, *, least: int = 1) -> FitSpec:
 
 def _scene(data: Mapping[str, Any], directory: Path, least: int) -> FitSpec:
     if "wavelengths_nm" in data:
-        raise InputError("an atmosphere, expected a scene file; the atmosphere where a fit starts goes with --init")
+        raise InputError("an atmosphere, expected a scene file, which names an atmosphere under init")
     _refuse_unknown(data, SCENE_KEYS)
     tables = data.get("image", [])
     if not isinstance(tables, list) or not all(isinstance(table, dict) for table in tables):
