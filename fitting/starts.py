@@ -104,9 +104,12 @@ def _scaled(block: Block, factor: float, shift: float) -> Float[np.ndarray, " n"
 
 
 def thinned(batch: Batch, count: int = PIXELS) -> tuple[Batch, Int[np.ndarray, "image p"]]:
-    """``batch`` with up to ``count`` pixels of each image, evenly among those used, and which they are."""
+    """``batch`` with ``count`` pixels of each image, evenly among those used, and which they are.
+
+    Of an image with fewer some are there more than once: another number would need another program.
+    """
     used = np.asarray(batch.used)
-    size = int(min(count, used.sum(axis=1).max()))
+    size = min(count, used.shape[1])
     chosen = np.stack([np.flatnonzero(row)[np.linspace(0, row.sum() - 1, size).astype(int)] for row in used])
     image = np.arange(len(used))[:, None]
     return replace(

@@ -277,6 +277,9 @@ MISTAKEN = {
     "equal exposures": (taken(1.0), {}, "a: every picture has the exposure 0.01, expected different ones"),
     "no positive ones": (taken(4.0), {"exposure_s": [0.01, 0.0]}, "a: exposures 0.01, 0, expected positive numbers"),
     "swapped": (taken(4.0), {"exposure_s": [0.04, 0.01]}, "a: 0.25 times as bright as b, where both are exposed well"),
+    "developed": (taken(2.0, taken_as_linear=True), {"exposure_s": [0.01, 0.04]}, "b: 2 times as bright as a, where both are "
+                  "exposed well, but by their exposures it would be 4 times; expected the exposures in the order of the files, "
+                  "or --transfer srgb if they were developed for a screen"),
     "no saturation": (taken(4.0), {"saturation": None}, "saturation: a does not say at which value it is clipped"),
     "no noise": (taken(4.0), {"noise_shot": 0.0}, "a: saturation = 1, shot = 0"),
 }  # fmt: skip

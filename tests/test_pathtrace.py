@@ -37,6 +37,10 @@ def test_scene_s1_within_the_standard_errors(shared, s1, sun_zenith_deg):
     assert np.mean(np.abs(z) > 3) < 0.05
 
 
+def test_paths_are_rounded_up_to_replicates_times_a_power_of_two():
+    assert [PathTrace(samples=n).paths for n in (1, 32, 33, 64, 65, 4096)] == [32, 32, 64, 64, 128, 4096]
+
+
 def test_same_seed_same_answer_other_seed_other_sample(s1):
     view, sun = directions([0.0, 60.0], [0.0, 30.0]), directions(40.0, 0.0)
     a, error = estimate(s1, view, sun, seed=1, samples=1024)

@@ -66,6 +66,16 @@ def test_thinned_batch_has_pixels_of_every_image_that_are_used():
     assert all(len(set(row)) == 50 for row in chosen)
 
 
+def test_thinned_batches_of_few_pixels_have_the_same_shape():
+    """A program is for one shape: what an image lacks, others of its pixels stand in for."""
+    for count in (7, 60):
+        mask = np.arange(16 * 64).reshape(16, 64) < count
+        batch, chosen = thinned(stack(toy_sky.observations(mask=mask), [680.0, 550.0, 440.0]), 50)
+        assert batch.measured.shape == (3, 50, 3)
+        assert bool(jnp.all(batch.used))
+        assert all(len(set(row)) == min(count, 50) for row in chosen)
+
+
 @pytest.mark.parametrize("factor", [1, 3])
 def test_the_truth_is_the_best_of_the_grid(factor):
     """Also if the exposure is unknown, which is then set for each atmosphere."""

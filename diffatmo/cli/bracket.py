@@ -93,7 +93,8 @@ def merge(
         )
     except ValueError as error:
         raise InputError(f"{files[0]}: {error}") from error
-    found = _check_exposures(files, pictures, exposures, white)
+    guessed = any(image.taken_as_linear for image in images)
+    found = _check_exposures(files, pictures, exposures, white, guessed=guessed)
     # What is lost in the noise of the shortest exposure is far from its saturation.
     shortest = pictures[int(np.argmin(exposures))]
     brightest = white / min(exposures)
@@ -154,9 +155,16 @@ def _exposure(file: Path, exif: "Exif") -> float:
 
 
 def _check_exposures(
-    files: Sequence[Path], pictures: "Sequence[np.ndarray]", exposures: Sequence[float], white: float
+    files: Sequence[Path],
+    pictures: "Sequence[np.ndarray]",
+    exposures: Sequence[float],
+    white: float,
+    *,
+    guessed: bool,
 ) -> Agreement | None:
     """How well neighbouring exposures agree on the light; None if no pixel is exposed well in both of two.
+
+    ``guessed`` are pictures that were taken as linear although they do not say so.
 
     Raises :class:`InputError` where they do not at all.
     """
@@ -175,6 +183,8 @@ def _check_exposures(
             raise InputError(
                 f"{files[longer]}: {np.median(ratio):.3g} times as bright as {files[shorter]}, where both are exposed well, "
                 f"but by their exposures it would be {stated:.3g} times; expected the exposures in the order of the files"
+                + guessed
+                * ", or --transfer srgb if they were developed for a screen"
             )
         parts = np.array_split(ratio, min(PARTS, max(ratio.size // PART_SIZE, 1)))
         apart = max(abs(math.log(np.median(part) / stated)) for part in parts)

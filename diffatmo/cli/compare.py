@@ -99,6 +99,7 @@ def compare(
 
     from diffatmo import comparison
     from diffatmo import scene as scenes
+    from diffatmo.models import PathTrace
 
     scene = make_scene(air, given, width, height)
     console = Console(width=None if Console().is_terminal else 120)
@@ -111,7 +112,7 @@ def compare(
             path, notes = output / f"picture_{name}.exr", {"model": name}
             scenes.save(path, outcomes[name].picture, scene, notes=notes, overwrite=True)
     found = {name: comparison.errors(scene, outcome, outcomes[truth]) for name, outcome in outcomes.items()}
-    _write(output, scene, outcomes, found, truth, samples)
+    _write(output, scene, outcomes, found, truth, PathTrace(samples=samples).paths)
     console.print(_table(outcomes, found, truth))
     console.print(f"Pictures and report: {output / 'compare.html'}", soft_wrap=True)
 
@@ -198,7 +199,7 @@ def _write(
     outcomes: "dict[str, Outcome]",
     found: "dict[str, Errors]",
     truth: str,
-    samples: int,
+    paths: int,
 ) -> None:
     import html
     import json
@@ -226,7 +227,7 @@ def _write(
         "schema_version": SCHEMA_VERSION,
         "diffatmo": __version__,
         "truth": truth,
-        "samples": samples if "pathtrace" in outcomes else None,
+        "paths": paths if "pathtrace" in outcomes else None,
         "scene": scenes.dumps(scene),
         "models": {
             name: known(

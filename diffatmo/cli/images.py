@@ -131,10 +131,12 @@ def open_image(spec: ImageSpec, *, may_be_photo: bool) -> Opened:
     merged = bracket.merge(spec.files, [view.image for view in views], spec.options, known)
     options["saturation"] = merged.image.saturation
     encoded, told = any(view.encoded for view in views), [merged.told]
-    if encoded and merged.exponent_error is not None and merged.exponent_error < EXPONENT_ERROR:
-        encoded = False
-        told.append("transfer function: that of sRGB, by which the exposures agree")
-    return Opened(replace(spec, options=options), merged.image, shot, encoded, tuple(told))
+    guessed = any(view.image.taken_as_linear for view in views)
+    if (encoded or guessed) and merged.exponent_error is not None and merged.exponent_error < EXPONENT_ERROR:
+        told.append(f"transfer function: {'that of sRGB' if encoded else 'linear'}, by which the exposures agree")
+        encoded = guessed = False
+    image = merged.image._replace(taken_as_linear=guessed)
+    return Opened(replace(spec, options=options), image, shot, encoded, tuple(told))
 
 
 class _View(NamedTuple):

@@ -186,6 +186,8 @@ def bracket(files: Sequence[Path], options: Mapping[str, Any]) -> ImageSpec:
 
 def read_scene(path: Path, *, least: int = 1) -> FitSpec:
     """Read a scene file with at least so many images; relative paths in it are relative to it."""
+    if path.exists() and not path.is_file():
+        raise InputError(f"{path}: is not a file, expected a scene file")
     try:
         data = tomllib.loads(path.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
@@ -199,7 +201,7 @@ def read_scene(path: Path, *, least: int = 1) -> FitSpec:
 
 
 def _scene(data: Mapping[str, Any], directory: Path, least: int) -> FitSpec:
-    if "wavelengths_nm" in data:
+    if "wavelengths_nm" in data and "image" not in data:
         raise InputError("an atmosphere, expected a scene file, which names an atmosphere under init")
     _refuse_unknown(data, SCENE_KEYS)
     tables = data.get("image", [])

@@ -57,6 +57,11 @@ class Resolution(NamedTuple):
     lanes: int
     panels: int
 
+    @property
+    def points(self) -> int:
+        """Paths of each replicate: a power of two, for the lattice."""
+        return 1 << max(0, math.ceil(math.log2(self.samples / self.replicates)))
+
 
 class PathTrace(Model):
     """Monte Carlo with ``samples`` paths per ray, all wavelengths on the same paths.
@@ -76,8 +81,16 @@ class PathTrace(Model):
     def sky(self, atmosphere: Atmosphere) -> "PathTraceSky":
         """Prepare the guide; the paths are traced when the sky is asked."""
         atmosphere = _refuse_derivatives(atmosphere)
-        resolution = Resolution(self.samples, self.replicates, self.lanes, self.panels)
-        return PathTraceSky(atmosphere, guide.build(atmosphere), jax.random.key(self.seed), resolution)
+        return PathTraceSky(atmosphere, guide.build(atmosphere), jax.random.key(self.seed), self._resolution)
+
+    @property
+    def _resolution(self) -> Resolution:
+        return Resolution(self.samples, self.replicates, self.lanes, self.panels)
+
+    @property
+    def paths(self) -> int:
+        """Paths per ray: ``samples``, rounded up."""
+        return self.replicates * self._resolution.points
 
 
 class Estimate(NamedTuple):
@@ -227,9 +240,8 @@ def _average(
     sky: PathTraceSky, rays: Rays, key: PRNGKeyArray, hemisphere: bool, apart: bool
 ) -> tuple[Float[Array, "part rays w"], Float[Array, "part rays w"]]:
     """Mean over the paths of each ray and its standard error, a chunk of rays at a time."""
-    samples, replicates, lanes, panels = sky.resolution
-    number = rays.altitude.size
-    points = 1 << max(0, math.ceil(math.log2(samples / replicates)))
+    _, replicates, lanes, panels = sky.resolution
+    number, points = rays.altitude.size, sky.resolution.points
     # Lanes of one replicate share its lattice; each gets some tens of paths, long enough to keep it busy to the end.
     shares = min(max(1, lanes // (number * replicates)), max(1, points // 16))
     shares = 1 << (shares.bit_length() - 1)
