@@ -25,7 +25,7 @@ def start(out, devices, *arguments):
 
 
 def finish(process, out):
-    said, _ = process.communicate(timeout=120)
+    said, _ = process.communicate(timeout=300)
     assert process.returncode == 0, said
     return json.loads(out.read_text())
 
@@ -51,13 +51,13 @@ def test_eight_devices(tmp_path, alone):
     assert_the_same(found, alone)
 
 
-def test_two_processes(tmp_path, alone):
+def test_two_processes_of_two_devices(tmp_path, alone):
     with socket.socket() as probe:
         probe.bind(("localhost", 0))
         address = f"localhost:{probe.getsockname()[1]}"
     outs = [tmp_path / f"{number}.json" for number in range(2)]
-    running = [start(out, 1, address, 2, number) for number, out in enumerate(outs)]
+    running = [start(out, 2, address, 2, number) for number, out in enumerate(outs)]
     for process, out in zip(running, outs, strict=True):
         found = finish(process, out)
-        assert found["devices"] == [2, 2]
+        assert found["devices"] == [4, 2]
         assert_the_same(found, alone)

@@ -112,7 +112,8 @@ def compare(
             path, notes = output / f"picture_{name}.exr", {"model": name}
             scenes.save(path, outcomes[name].picture, scene, notes=notes, overwrite=True)
     found = {name: comparison.errors(scene, outcome, outcomes[truth]) for name, outcome in outcomes.items()}
-    _write(output, scene, outcomes, found, truth, PathTrace(samples=samples).paths)
+    paths = PathTrace(samples=samples).paths if "pathtrace" in names else None
+    _write(output, scene, outcomes, found, truth, paths)
     console.print(_table(outcomes, found, truth))
     console.print(f"Pictures and report: {output / 'compare.html'}", soft_wrap=True)
 
@@ -199,7 +200,7 @@ def _write(
     outcomes: "dict[str, Outcome]",
     found: "dict[str, Errors]",
     truth: str,
-    paths: int,
+    paths: int | None,
 ) -> None:
     import html
     import json
@@ -227,7 +228,7 @@ def _write(
         "schema_version": SCHEMA_VERSION,
         "diffatmo": __version__,
         "truth": truth,
-        "paths": paths if "pathtrace" in outcomes else None,
+        "paths": paths,
         "scene": scenes.dumps(scene),
         "models": {
             name: known(

@@ -19,7 +19,7 @@ from diffatmo.cli.scenefile import FREE, IMAGE_KEYS, LOSSES, MODELS, FitSpec, br
     "--config",
     metavar="SCENE.toml",
     type=click.Path(path_type=Path),
-    help="Scene file, instead of images; SCENE.toml alone says the same.",
+    help="Scene file, instead of images; SCENE.toml alone does the same.",
 )
 @click.option(
     "--init",
