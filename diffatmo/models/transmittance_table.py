@@ -5,13 +5,16 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from diffatmo import geometry
-from diffatmo._types import Altitude, Cosine, Length, Transmittance
+from diffatmo._types import Altitude, Cosine, Length, Scalar, Transmittance
 from diffatmo.atmosphere import Atmosphere
 from diffatmo.models.tables import Planet, bilinear
 from diffatmo.numerics import bounded_divide
 
 SUN_ANGULAR_RADIUS = 0.00935 / 2
 """rad; that of Bruneton's demonstration of 2017. Over this range of its height the sun sets."""
+
+ROWS = 8
+"""Rows of the table computed at once."""
 
 
 def trapezoid(i: Array, steps: int) -> Array:
@@ -22,19 +25,20 @@ def trapezoid(i: Array, steps: int) -> Array:
 def compute_transmittance(atmosphere: Atmosphere, planet: Planet, steps: int) -> Float[Array, "r mu w"]:
     """T(r, mu) to the top of the atmosphere, by the trapezoidal rule (paper, eq. 5)."""
     altitude, mu = planet.transmittance_nodes()
-    altitude = jnp.broadcast_to(altitude[:, None], mu.shape)
-    length = geometry.distance_up(altitude, mu, planet.top_altitude, planet.bottom_radius)
     profiles = atmosphere.rayleigh_density, atmosphere.mie_density, atmosphere.ozone_density
+    i = jnp.arange(steps + 1)[:, None]
 
-    def step(columns: Array, i: Array) -> tuple[Array, None]:
+    def row(node: tuple[Scalar, Float[Array, " mu"]]) -> Float[Array, "3 mu"]:
+        altitude, mu = node
+        length = geometry.distance_up(altitude, mu, planet.top_altitude, planet.bottom_radius)
         here = geometry.altitude_along(altitude, mu, length * (i / steps), planet.bottom_radius)
-        return columns + trapezoid(i, steps) * jnp.stack(
-            [profile(jnp.maximum(here, 0)) for profile in profiles], axis=-1
-        ), None
+        densities = jnp.stack([profile(jnp.maximum(here, 0)) for profile in profiles])
+        return length * jnp.sum(trapezoid(i, steps) * densities, axis=1)
 
-    columns, _ = jax.lax.scan(step, jnp.zeros((*mu.shape, 3), mu.dtype), jnp.arange(steps + 1))
+    # Some rows after the others: the samples stay in the cache.
+    columns = jax.lax.map(row, (altitude, mu), batch_size=ROWS)
     coefficients = jnp.stack([atmosphere.rayleigh_scattering, atmosphere.mie_extinction, atmosphere.ozone_absorption])
-    depth = jnp.sum((columns * length[..., None])[..., None] * coefficients, axis=-2)
+    depth = jnp.sum(columns[..., None] * coefficients[:, None], axis=1)
     return jnp.exp(-depth)
 
 

@@ -191,14 +191,17 @@ def compute(atmosphere: Atmosphere, planet: Planet, multiple_size: tuple[int, in
     # Irradiance of the ground: the sky marched in a few directions, weighted by their cosine.
     mu_s = planet.mu_s_nodes()
     middle = (np.arange(steps.directions) + 0.5) / steps.directions
-    mu = jnp.asarray(np.sqrt(middle), mu_s.dtype)[:, None, None]
-    azimuths = jnp.asarray(np.cos(np.pi * middle), mu_s.dtype)[:, None]
-    nu = mu * mu_s + geometry.sine(mu) * geometry.sine(mu_s) * azimuths
+    mu = jnp.asarray(np.sqrt(middle), mu_s.dtype)[:, None]
+    azimuths = jnp.repeat(jnp.asarray(np.cos(np.pi * middle), mu_s.dtype), mu_s.size)
+    # Azimuths and suns in one axis, for which the place along the ray is the same.
+    suns = jnp.tile(mu_s, steps.directions)
+    nu = mu * suns + geometry.sine(mu) * geometry.sine(suns) * azimuths
     level = jnp.zeros_like(mu)
     length = geometry.distance_up(level, mu, planet.top_altitude, planet.bottom_radius)
     ends = quadratic(length, steps.multiple)
-    light = march(atmosphere, planet, transmittance, multiple, level, mu, mu_s, nu, ends).light
-    return Luts(transmittance, multiple, jnp.pi * jnp.mean(light, axis=(0, 1)))
+    light = march(atmosphere, planet, transmittance, multiple, level, mu, suns, nu, ends).light
+    light = light.reshape(-1, mu_s.size, light.shape[-1])
+    return Luts(transmittance, multiple, jnp.pi * jnp.mean(light, axis=0))
 
 
 class SkyView(eqx.Module):
