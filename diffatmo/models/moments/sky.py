@@ -262,8 +262,8 @@ class MomentsView(View):
         corners = patch(row.reshape(-1), column.reshape(-1)).reshape(
             *mu.shape, 4, 4, -1, self.log_transmittance.shape[1]
         )
-        weights = row_weights[..., :, None] * column_weights[..., None, :]
-        return jnp.einsum("...abcw,...ab->...cw", corners, weights), row, row_weights, nu
+        weights = (row_weights[..., :, None] * column_weights[..., None, :])[..., None, None]
+        return jnp.sum(corners * weights, axis=(-4, -3)), row, row_weights, nu
 
     @whole_products
     def radiance(self, *, view: Direction) -> Ray:

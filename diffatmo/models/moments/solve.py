@@ -21,9 +21,6 @@ from diffatmo.models.moments.shell import Links, Rays, Shell, Ways
 from diffatmo.numerics import per_parameter, tiny
 from diffatmo.rays import PIECES, Nodes
 
-CHUNK = 2
-"""Altitude nodes computed at once: few enough for the cache, enough to keep the processors busy."""
-
 
 class Degrees(NamedTuple):
     """Degrees to which the moments are kept."""
@@ -81,9 +78,7 @@ def _first_order(atmosphere: Atmosphere, shell: Shell, degree: int, peak_azimuth
     r = shell.first
     parts = shell.altitude, r.mu, r.solid_angle, r.nodes, r.mu_s_here, r.mu_s_ground
     # One altitude node after another: the temporary arrays stay in the cache.
-    by_order = jax.lax.map(
-        lambda part: _first_order_at(atmosphere, shell.mu_s, degree, peak_azimuths, *part), parts, batch_size=CHUNK
-    )
+    by_order = jax.lax.map(lambda part: _first_order_at(atmosphere, shell.mu_s, degree, peak_azimuths, *part), parts)
     by_order = by_order * (atmosphere.solar_irradiance[:, None] / shell.dusk)
     return State(_moments(r, by_order, degree), _irradiance(r, by_order[:, 0]))
 
@@ -127,11 +122,15 @@ def _first_order_at(
     along, end = transmittance.columns_along(atmosphere, start, mu, nodes, n // PIECES)
     view = jnp.exp(-transmittance.optical_depth(atmosphere, along)) * nodes.weight[..., None]
     # Few axes, long inside, wavelengths outside: short inner axes would cost the vector units.
-    mu_s_flat = mu_s_here.reshape(k * n, p * j)
-    here = jnp.broadcast_to(nodes.altitude.reshape(-1, 1), mu_s_flat.shape)
-    towards_sun, free = transmittance.to_top(atmosphere, here, mu_s_flat)
+    # The last rows are the points where rays meet the ground.
+    mu_s_flat = jnp.concatenate([mu_s_here.reshape(k * n, p * j), mu_s_ground.reshape(-1, p * j)])
+    altitudes = jnp.pad(nodes.altitude.reshape(-1), (0, mu_s_ground.shape[0]))
+    towards_sun, free = transmittance.to_top(
+        atmosphere, jnp.broadcast_to(altitudes[:, None], mu_s_flat.shape), mu_s_flat
+    )
     depth = transmittance.spectral_depth(atmosphere, towards_sun)
-    light = (jnp.exp(-jnp.where(free, depth, 0)) * free).reshape(-1, k, n, p * j)
+    sunlight = jnp.exp(-jnp.where(free, depth, 0)) * free
+    light = sunlight[:, : k * n].reshape(-1, k, n, p * j)
     densities = transmittance.exponentials(transmittance.scale_heights(atmosphere), nodes.altitude)
     coefficients = jnp.stack([atmosphere.rayleigh_scattering, atmosphere.mie_scattering])
     weight = densities[..., None] * view * coefficients[:, None, None]
@@ -146,12 +145,11 @@ def _first_order_at(
     phases = phase.rayleigh(nu), _peak(atmosphere.mie_phase)(atmosphere.mie_g[None], nu, solid_angle)[0]
     turned = [jnp.swapaxes(jnp.tensordot(products.T, phase_, axes=1), 1, 2)[:, :, None] for phase_ in phases]
     by_order = sum(jnp.sum(turned[c] * smooth[:, :, c], axis=3) for c in range(2))
-    ground_level = jnp.zeros_like(mu_s_ground)
-    sunlit = jnp.maximum(mu_s_ground, 0)[..., None] * transmittance.to_sun(atmosphere, ground_level, mu_s_ground)
+    sunlit = jnp.maximum(mu_s_ground, 0) * sunlight[:, k * n :].reshape(-1, *mu_s_ground.shape)
     sky = k - mu_s_ground.shape[0]
-    survives = jnp.exp(-transmittance.optical_depth(atmosphere, end))[sky:, None, None, :]
-    reflected = atmosphere.ground_albedo / jnp.pi * survives * sunlit
-    reflected = jnp.tensordot(reflected, to_fine.T @ harmonics, axes=(1, 0)).transpose(3, 0, 2, 1)
+    survives = jnp.exp(-transmittance.spectral_depth(atmosphere, end))[:, sky:, None, None]
+    reflected = (atmosphere.ground_albedo / jnp.pi)[:, None, None, None] * survives * sunlit
+    reflected = jnp.tensordot(reflected, to_fine.T @ harmonics, axes=(2, 0)).transpose(3, 1, 0, 2)
     return by_order + _below(reflected, sky, axis=1)
 
 
