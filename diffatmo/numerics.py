@@ -117,6 +117,22 @@ def scaled_erfcx(x: Float[Array, "..."], exponent: Float[Array, "..."]) -> Float
     return t * jnp.exp(polynomial + exponent)
 
 
+def _moved(
+    function: Callable[..., Float[Array, "n ..."]], arrays: list[Any], tangents: list[Any]
+) -> Float[Array, "n ..."] | None:
+    """Tangent of ``function(*arrays)``; ``None`` where all ``tangents`` are known to be zero."""
+    flat, structure = jax.tree.flatten(tangents, is_leaf=lambda t: isinstance(t, SymbolicZero))
+    if all(isinstance(t, SymbolicZero) for t in flat):
+        return None
+    dense = [jnp.zeros(t.shape, t.dtype) if isinstance(t, SymbolicZero) else t for t in flat]
+    tangent: Float[Array, "n ..."] = jax.jvp(function, tuple(arrays), tuple(jax.tree.unflatten(structure, dense)))[1]
+    return tangent
+
+
+def _product(weights: Float[Array, "w n"], rows: Float[Array, "n ..."]) -> Float[Array, "w ..."]:
+    return jnp.tensordot(weights, rows, axes=1, precision="highest")
+
+
 def per_parameter(function: Callable[..., Float[Array, "n ..."]]) -> Callable[..., Float[Array, "n ..."]]:
     """``function(parameters, *arrays)``, whose derivatives by the ``parameters`` are computed once for all tangents.
 
@@ -133,16 +149,41 @@ def per_parameter(function: Callable[..., Float[Array, "n ..."]]) -> Callable[..
         value, slopes = jax.jvp(lambda p: function(p, *arrays), (parameters,), (jnp.ones_like(parameters),))
         tangent = jnp.zeros_like(value)
         if not isinstance(towards, SymbolicZero):
-            tangent = jnp.tensordot(jnp.diag(towards), slopes, axes=1, precision="highest")
-        flat, structure = jax.tree.flatten(moving, is_leaf=lambda t: isinstance(t, SymbolicZero))
-        if not all(isinstance(t, SymbolicZero) for t in flat):
-            dense = [jnp.zeros(t.shape, t.dtype) if isinstance(t, SymbolicZero) else t for t in flat]
-            arrays_moved = tuple(jax.tree.unflatten(structure, dense))
-            tangent = tangent + jax.jvp(lambda *a: function(parameters, *a), tuple(arrays), arrays_moved)[1]
-        return value, tangent
+            tangent = _product(jnp.diag(towards), slopes)
+        moved = _moved(lambda *a: function(parameters, *a), arrays, moving)
+        return value, tangent if moved is None else tangent + moved
 
     shared.defjvp(rule, symbolic_zeros=True)
     return shared
+
+
+def weighted(function: Callable[..., Float[Array, "n ..."]]) -> Callable[..., Float[Array, "w ..."]]:
+    """``weights @ function(parameters, *arrays)``, called with the weights first, for a function as in :func:`per_parameter`.
+
+    Its derivative by weights and parameters is one product of matrices, and the rows' own derivatives are never written out.
+    """
+
+    @jax.custom_jvp
+    def combined(weights: Float[Array, "w n"], parameters: Float[Array, " n"], *arrays: Any) -> Float[Array, "w ..."]:
+        return _product(weights, function(parameters, *arrays))
+
+    def rule(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Any, Any]:
+        weights, parameters, *arrays = primals
+        heavier, towards, *moving = tangents
+        rows, slopes = jax.jvp(lambda p: function(p, *arrays), (parameters,), (jnp.ones_like(parameters),))
+        value = _product(weights, rows)
+        terms = [(heavier, rows)] if not isinstance(heavier, SymbolicZero) else []
+        if not isinstance(towards, SymbolicZero):
+            terms.append((weights * towards, slopes))
+        tangent = jnp.zeros_like(value)
+        if terms:
+            factors, parts = zip(*terms, strict=True)
+            tangent = _product(jnp.concatenate(factors, axis=1), jnp.concatenate(parts))
+        moved = _moved(lambda *a: function(parameters, *a), arrays, moving)
+        return value, tangent if moved is None else tangent + _product(weights, moved)
+
+    combined.defjvp(rule, symbolic_zeros=True)
+    return combined
 
 
 def gauss_legendre(count: int, lower: float = 0.0, upper: float = 1.0) -> tuple[np.ndarray, np.ndarray]:

@@ -67,3 +67,22 @@ def test_slopes_shared_by_tangents_are_the_derivatives(x64):
     both = lambda f: jax.hessian(lambda p: f(p, x * p[0]).sum())(parameters)
     np.testing.assert_allclose(both(shared), both(plain), rtol=1e-10)
     assert float(jnp.abs(jax.grad(lambda c: c * shared(parameters, x).sum())(1.0))) > 0
+
+
+def test_the_derivative_of_weighted_rows_is_that_of_the_product(x64):
+    """By weights, parameters, an array, all of them and none; forward, reverse and twice."""
+
+    def rows(parameters, x):
+        return jnp.exp(-x[None] / parameters[:, None]) * x
+
+    combined, plain = numerics.weighted(rows), lambda weights, *rest: weights @ rows(*rest)
+    at = jnp.array([[0.3, 1.0], [2.0, -0.4], [0.0, 0.7]]), jnp.array([1.5, 3.0]), jnp.linspace(0.2, 2.0, 5)
+    np.testing.assert_allclose(combined(*at), plain(*at))
+    for numbers in (0, 2, (0, 1, 2)):
+        want = jax.tree.leaves(jax.jit(jax.jacfwd(plain, numbers))(*at))
+        for derivative in (jax.jacfwd, jax.jacrev):
+            for one, other in zip(jax.tree.leaves(jax.jit(derivative(combined, numbers))(*at)), want, strict=True):
+                np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-14)
+    bent = lambda f: jax.jit(jax.hessian(lambda p: f(at[0] * p[0], p, at[2] * p[1]).sum()))(at[1])
+    np.testing.assert_allclose(bent(combined), bent(plain), rtol=1e-10)
+    assert float(jax.grad(lambda c: c * combined(*at).sum())(1.0)) == pytest.approx(float(plain(*at).sum()))

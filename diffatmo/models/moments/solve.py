@@ -125,10 +125,9 @@ def _first_order_at(
     # The last rows are the points where rays meet the ground.
     mu_s_flat = jnp.concatenate([mu_s_here.reshape(k * n, p * j), mu_s_ground.reshape(-1, p * j)])
     altitudes = jnp.pad(nodes.altitude.reshape(-1), (0, mu_s_ground.shape[0]))
-    towards_sun, free = transmittance.to_top(
+    depth, free = transmittance.depth_to_top(
         atmosphere, jnp.broadcast_to(altitudes[:, None], mu_s_flat.shape), mu_s_flat
     )
-    depth = transmittance.spectral_depth(atmosphere, towards_sun)
     sunlight = jnp.exp(-jnp.where(free, depth, 0)) * free
     light = sunlight[:, : k * n].reshape(-1, k, n, p * j)
     densities = transmittance.exponentials(transmittance.scale_heights(atmosphere), nodes.altitude)
