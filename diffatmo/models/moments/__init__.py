@@ -42,9 +42,9 @@ class Moments(Model):
 
     altitudes: int = 16
     suns: int = 24
-    first: Directions = Directions(sky=12, ground=6, azimuths=6, steps=8, degree=10)
-    iterate: Directions = Directions(sky=5, ground=3, azimuths=4, steps=4, degree=3)
-    last: Directions = Directions(sky=7, ground=5, azimuths=6, steps=4, degree=8)
+    first: Directions = Directions(sky=11, ground=6, azimuths=5, steps=8, degree=10)
+    iterate: Directions = Directions(sky=5, ground=4, azimuths=4, steps=5, degree=3)
+    last: Directions = Directions(sky=8, ground=5, azimuths=7, steps=5, degree=8)
     source_degree: int = 4
     peak_azimuths: int = 32
     order: int = 4
@@ -72,8 +72,8 @@ class Moments(Model):
 
         def more(count: Directions) -> Directions:
             degree = count.degree + 3 + count.degree // 4
-            azimuths = count.azimuths + degree - count.degree
-            return Directions(2 * count.sky, 2 * count.ground, azimuths, count.steps + 5, degree)
+            azimuths = count.azimuths + degree - count.degree + 1
+            return Directions(2 * count.sky + 2, 2 * count.ground, azimuths, count.steps + 5, degree)
 
         return Moments(
             altitudes=7 * self.altitudes // 4,
