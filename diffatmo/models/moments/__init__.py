@@ -42,12 +42,12 @@ class Moments(Model):
 
     altitudes: int = 16
     suns: int = 24
-    first: Directions = Directions(sky=11, ground=6, azimuths=5, steps=8, degree=10)
+    first: Directions = Directions(sky=12, ground=6, azimuths=5, steps=8, degree=10)
     iterate: Directions = Directions(sky=5, ground=4, azimuths=4, steps=5, degree=3)
     last: Directions = Directions(sky=8, ground=5, azimuths=7, steps=5, degree=8)
     source_degree: int = 4
     peak_azimuths: int = 32
-    order: int = 4
+    order: int = 5
     view_steps: int = 10
     view_sky: int = 48
     view_ground: int = 20
@@ -73,7 +73,7 @@ class Moments(Model):
         def more(count: Directions) -> Directions:
             degree = count.degree + 3 + count.degree // 4
             azimuths = count.azimuths + degree - count.degree + 1
-            return Directions(2 * count.sky + 2, 2 * count.ground, azimuths, count.steps + 5, degree)
+            return Directions(2 * count.sky, 2 * count.ground, azimuths, count.steps + 5, degree)
 
         return Moments(
             altitudes=7 * self.altitudes // 4,
@@ -83,7 +83,7 @@ class Moments(Model):
             last=more(self.last),
             source_degree=5 * self.source_degree // 2,
             peak_azimuths=2 * self.peak_azimuths,
-            order=self.order + 2,
+            order=self.order + 1,
             view_steps=self.view_steps + 6,
             view_sky=2 * self.view_sky,
             view_ground=2 * self.view_ground,
