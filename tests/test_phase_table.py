@@ -118,13 +118,16 @@ def test_models_take_it(model):
 def test_a_table_that_is_zero_wherever_one_looks_is_no_division_by_zero():
     """Light goes back within 10° only, between the nodes at which moments sum the peak: its light is spread, not lost."""
     haze = replace(diffatmo.earth(), mie_scattering=jnp.full(3, 0.13), mie_scale_height=2.2)
-    back = np.asarray(seen(diffatmo.Moments(), replace(haze, mie_phase=PhaseTable([0, 170, 180], [0, 0, 1]))))
+    backward = replace(haze, mie_phase=PhaseTable([0, 170, 180], [0, 0, 1]))
+    back = np.asarray(seen(diffatmo.Moments(), backward))
     clear = np.asarray(
         seen(diffatmo.Moments(), replace(haze, mie_scattering=jnp.zeros(3), mie_absorption=jnp.zeros(3)))
     )
     assert np.all(np.isfinite(back))
     # What the haze takes from the sun's light goes somewhere: the sky is not black.
     assert np.all(back > 0.3 * clear)
+    # The orders of scattering fall off: light thrown back was once taken for a forward peak, and each was 2.5 times the last.
+    np.testing.assert_allclose(seen(replace(diffatmo.Moments(), order=6), backward), back, rtol=0.02)
 
 
 def test_the_path_tracer_samples_it():

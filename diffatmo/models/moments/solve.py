@@ -196,9 +196,9 @@ class _Transport(eqx.Module):
         """Prepare for single scattering known to degree ``first`` and all other light to degree ``further``."""
         r = links.rays
         start = jnp.broadcast_to(shell.altitude[:, None], r.mu.shape)
-        # No forward peak where scattering is backward.
-        forward = jnp.maximum(atmosphere.mie_g, 0)
-        peak = phase.mie_moments(forward, further + 1, atmosphere.mie_phase)[-1]
+        # The moments of a forward peak are alike; of a backward one every second is negative, and there is nothing to take out.
+        moments = phase.mie_moments(atmosphere.mie_g, further + 1, atmosphere.mie_phase)
+        peak = jnp.maximum(jnp.minimum(moments[-2], moments[-1]), 0)
         thin = eqx.tree_at(lambda a: a.mie_scattering, atmosphere, (1 - peak) * atmosphere.mie_scattering)
         along, end = transmittance.columns_along(atmosphere, start, r.mu, r.nodes, r.steps)
         view = (jnp.exp(-transmittance.optical_depth(thin, along)) * r.nodes.weight[..., None])[..., None, :]
