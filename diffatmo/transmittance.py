@@ -159,17 +159,6 @@ def to_top(atmosphere: Atmosphere, altitude: Altitude, mu: Cosine) -> tuple[Colu
     return Columns(_columns_to_top(scale_heights(atmosphere), altitude, mu, *planet), ramps), free
 
 
-def depth_to_top(
-    atmosphere: Atmosphere, altitude: Altitude, mu: Cosine
-) -> tuple[Float[Array, "w ..."], Bool[Array, "..."]]:
-    """:func:`spectral_depth` of :func:`to_top`, with a derivative that costs less: columns for every tangent are not made."""
-    ramps, free = _ramps_to_top(atmosphere, altitude, mu)
-    planet = atmosphere.bottom_radius, atmosphere.top_altitude
-    scattering, absorption = _coefficients(atmosphere)
-    exponential = _depth_to_top(scattering, scale_heights(atmosphere), altitude, mu, *planet)
-    return exponential + jnp.tensordot(absorption, ramps, axes=1, precision="highest"), free
-
-
 @per_parameter
 def exponentials(heights: Float[Array, " n"], altitude: Altitude) -> Float[Array, "n ..."]:
     """exp(-h / H): with two scale heights the relative densities of air and of aerosol."""
@@ -198,9 +187,20 @@ def along(atmosphere: Atmosphere, altitude: Altitude, mu: Cosine, distance: Leng
     return jnp.exp(-optical_depth(atmosphere, columns_along(atmosphere, altitude, mu, nodes, steps)[1]))
 
 
+def spectral_to_sun(atmosphere: Atmosphere, altitude: Altitude, mu_s: Cosine) -> Float[Array, "w ..."]:
+    """:func:`to_sun` with the wavelengths outermost, as in :func:`spectral_depth`.
+
+    Its derivative costs less than that of :func:`to_top`: columns for every tangent are not made.
+    """
+    ramps, free = _ramps_to_top(atmosphere, altitude, mu_s)
+    planet = atmosphere.bottom_radius, atmosphere.top_altitude
+    scattering, absorption = _coefficients(atmosphere)
+    depth = _depth_to_top(scattering, scale_heights(atmosphere), altitude, mu_s, *planet)
+    depth = depth + jnp.tensordot(absorption, ramps, axes=1, precision="highest")
+    # The columns of a blocked ray mean nothing: put nothing under the exponential.
+    return jnp.exp(-jnp.where(free, depth, 0)) * free
+
+
 def to_sun(atmosphere: Atmosphere, altitude: Altitude, mu_s: Cosine) -> Transmittance:
     """Transmittance from a point to the sun; 0 in the planet's shadow (Bruneton & Neyret 2008, L_0)."""
-    depth, free = depth_to_top(atmosphere, altitude, mu_s)
-    # The columns of a blocked ray mean nothing: put nothing under the exponential.
-    light = jnp.exp(-jnp.where(free, depth, 0)) * free
-    return jnp.moveaxis(light, 0, -1)
+    return jnp.moveaxis(spectral_to_sun(atmosphere, altitude, mu_s), 0, -1)

@@ -72,6 +72,7 @@ class Moments(Model):
 
         def more(count: Directions) -> Directions:
             degree = count.degree + 3 + count.degree // 4
+            # One more than the default spares.
             azimuths = count.azimuths + degree - count.degree + 1
             return Directions(2 * count.sky, 2 * count.ground, azimuths, count.steps + 5, degree)
 

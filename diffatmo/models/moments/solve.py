@@ -125,10 +125,8 @@ def _first_order_at(
     # The last rows are the points where rays meet the ground.
     mu_s_flat = jnp.concatenate([mu_s_here.reshape(k * n, p * j), mu_s_ground.reshape(-1, p * j)])
     altitudes = jnp.pad(nodes.altitude.reshape(-1), (0, mu_s_ground.shape[0]))
-    depth, free = transmittance.depth_to_top(
-        atmosphere, jnp.broadcast_to(altitudes[:, None], mu_s_flat.shape), mu_s_flat
-    )
-    sunlight = jnp.exp(-jnp.where(free, depth, 0)) * free
+    here = jnp.broadcast_to(altitudes[:, None], mu_s_flat.shape)
+    sunlight = transmittance.spectral_to_sun(atmosphere, here, mu_s_flat)
     light = sunlight[:, : k * n].reshape(-1, k, n, p * j)
     densities = transmittance.exponentials(transmittance.scale_heights(atmosphere), nodes.altitude)
     coefficients = jnp.stack([atmosphere.rayleigh_scattering, atmosphere.mie_scattering])
