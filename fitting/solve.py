@@ -448,9 +448,9 @@ def solve(
     problem, finer = pose(batch, parameters, priors, loss, model), model.finer() if refine else None
     _check_weights(batch, problem.weight, names)
     compiling = _compile_ahead(problem, finer)
-    problem = replace(problem, shell=outermost(planet_shell)(model, parameters))
-    for thread in compiling[:1]:
+    for thread in compiling[:2]:
         thread.join()
+    problem = replace(problem, shell=outermost(planet_shell)(model, parameters))
     run = _Run(tolerance, max_steps, progress, checkpoint, identity)
     if saved is None:
         y, start = run.begin(problem.start, problem)
@@ -471,7 +471,7 @@ def solve(
     minima = [(point.y, point.chi2) for point in (found.best, *found.rivals)] if found.rivals else []
     error, alone = np.zeros((size, size)), found.best
     if finer is not None and found.best.converged:
-        for thread in compiling[1:]:
+        for thread in compiling[2:]:
             thread.join()
         found, error = _refined(run, found, finer)
     best, problem = found.best, found.problem
@@ -503,12 +503,15 @@ def solve(
 
 
 def _compile_ahead(problem: Problem, finer: Model | None) -> list[Thread]:
-    """The programs of a fit, compiled at the same time, the longest first. Not those of several devices."""
+    """The programs of a fit, compiled while the next one is traced, in the order of use. Not those of several devices."""
     batch = problem.batch
     if batch.mesh is not None:
         return []
     linear = jnp.zeros(batch.nuisances.linear, problem.start.dtype)
-    compiling = [compile_ahead(linearise, problem.start, linear, problem)]
+    compiling = [
+        compile_ahead(planet_shell, problem.model, problem.parameters),
+        compile_ahead(linearise, problem.start, linear, problem),
+    ]
     if finer is not None:
         compiling.append(compile_ahead(model_error.correction, problem.start, problem, batch.measured, finer))
     return compiling
