@@ -15,7 +15,7 @@ from diffatmo import atmosphere as atmospheres
 from diffatmo import imageio
 from diffatmo._types import Direction
 from diffatmo.atmosphere import Atmosphere
-from diffatmo.camera import Camera
+from diffatmo.camera import Camera, to_dict
 from diffatmo.compiling import outermost
 from diffatmo.models import Bruneton, Hillaire
 from diffatmo.models.bruneton import BrunetonSky
@@ -26,6 +26,8 @@ RADIANCE = "W m^-2 sr^-1 nm^-1, or relative like the solar irradiance"
 IRRADIANCE = "W m^-2 nm^-1, or relative like the solar irradiance"
 HALF_FLOOR = 1e-3
 """Entries below this part of the largest are not judged when the error of half precision is stated."""
+HALF_LOST = 0.1
+"""Error of half precision from which on a texture is not written in it: its numbers are outside 6e-8 to 65504."""
 
 
 class Texture(NamedTuple):
@@ -38,6 +40,8 @@ class Texture(NamedTuple):
     unit: str
     omits: str
     spectral: bool = True
+    place: str = ""
+    """Altitude, sun and camera that the table belongs to, if it does."""
     """Channels are the atmosphere's wavelengths; otherwise red, green, blue, alpha."""
 
 
@@ -83,6 +87,8 @@ def hillaire(
         return sky, sky.view(altitude=place, sun=sun), volume
 
     sky, view, volume = outermost(solve)(atmosphere)
+    place = f"altitude {altitude:g} km, sun in direction {' '.join(f'{float(x):.7g}' for x in sun)} (east, north, up)"
+    framed = f"{place}, camera: {', '.join(f'{key} {value}' for key, value in to_dict(camera).items())}"
     slices = f"width x, height y, depth distance / {reach:g} km (first slice: the end of the first step)"
     return [
         Texture("transmittance", np.asarray(sky.luts.transmittance)[None], "width mu, height r", "1", "refraction"),
@@ -99,25 +105,32 @@ def hillaire(
             "width longitude from the sun, height latitude about the horizon (first row: the nadir)",
             RADIANCE,
             "the sun's disc; light of the ground seen directly",
+            place=place,
         ),
         Texture(
-            "aerial_perspective", np.asarray(volume.light)[1:], slices, RADIANCE, "what lies behind; times the transmittance"
+            "aerial_perspective",
+            np.asarray(volume.light)[1:],
+            slices,
+            RADIANCE,
+            "what lies behind; times the transmittance",
+            place=framed,
         ),
-        Texture("aerial_transmittance", np.asarray(volume.transmittance)[1:], slices, "1", "refraction"),
-    ]  # fmt: skip
+        Texture("aerial_transmittance", np.asarray(volume.transmittance)[1:], slices, "1", "refraction", place=framed),
+    ]
 
 
 def half_error(texels: np.ndarray) -> float:
     """Largest relative error that half precision makes in entries that matter."""
     counts = np.abs(texels) > HALF_FLOOR * np.abs(texels).max()
-    coarse = texels.astype(np.float16).astype(np.float32)
+    with np.errstate(over="ignore"):
+        coarse = texels.astype(np.float16).astype(np.float32)
     return float(np.max(np.abs(coarse[counts] / texels[counts] - 1))) if counts.any() else 0.0
 
 
 def write(
     textures: list[Texture], directory: Path, atmosphere: Atmosphere, parameterisation: str, *, overwrite: bool = False
 ) -> list[Path]:
-    """Write every texture as EXR, in single and in half precision, and return the paths.
+    """Write every texture as EXR, in single and, unless :data:`HALF_LOST`, in half precision, and return the paths.
 
     A flat one is one picture. One with depth is one picture with its slices below each other, which in memory is the 3-d
     texture, and a folder with a picture for every slice. The header of each says what it holds.
@@ -127,6 +140,9 @@ def write(
         folder = directory / precision
         folder.mkdir(parents=True, exist_ok=True)
         for texture in textures:
+            error = half_error(texture.texels)
+            if precision == "half" and error > HALF_LOST:
+                continue
             depth, height, width, channels = texture.texels.shape
             about: dict[str, imageio.Attribute] = {
                 "table": texture.name,
@@ -135,9 +151,11 @@ def write(
                 "unit": texture.unit,
                 "omits": texture.omits,
                 "parameterisation": parameterisation,
-                "half_relative_error": half_error(texture.texels),
+                "half_relative_error": error,
                 "atmosphere": atmospheres.dumps(atmosphere),
             }
+            if texture.place:
+                about["place"] = texture.place
             bands = np.asarray(atmosphere.wavelengths) if texture.spectral else None
             pictures = {f"{texture.name}.exr": texture.texels.reshape(depth * height, width, channels)}
             if depth > 1:

@@ -19,7 +19,7 @@ from diffatmo.atmosphere import Atmosphere
 from diffatmo.numerics import array, safe_log
 from fitting._errors import FitError
 from fitting.parameters import Parameters
-from fitting.quantities import DERIVED, REFERENCE_NM, Quantity, numbers, quantities
+from fitting.quantities import DERIVED, REFERENCE_NM, Quantity, numbers, quantities, spectral_name
 
 
 @dataclass(frozen=True)
@@ -161,19 +161,19 @@ AEROSOLS = {
 def aerosol(kind: str, parameters: Parameters) -> list[Prior]:
     """An aerosol of a type of OPAC (Hess, Koepke & Schult 1998, Bull. Amer. Meteor. Soc. 79, 831, table 4).
 
-    As far as these vary in the fit: single scattering albedo ± 0.04 at each wavelength, asymmetry ± 0.04, Ångström exponent
-    ± 0.3, by which the types differ among themselves and with humidity.
+    As far as these vary in the fit: single scattering albedo ± 0.04 (at each wavelength, unless it is one number), asymmetry
+    ± 0.04, Ångström exponent ± 0.3, by which the types differ among themselves and with humidity.
     """
     if kind not in AEROSOLS:
         raise FitError(f"prior: aerosol: got {kind!r}, expected one of {', '.join(AEROSOLS)}")
     albedo, asymmetry, exponent = AEROSOLS[kind]
     source = f"Hess et al. 1998, {kind}"
     wanted = [
-        Prior("mie_single_scattering_albedo", albedo, 0.04 * _repeated(parameters), source=source),
+        Prior(_once("mie_single_scattering_albedo", parameters), albedo, 0.04, source=source),
         Prior("mie_g", asymmetry, 0.04, source=source),
         Prior("mie_angstrom_exponent", exponent, 0.3, source=source),
     ]
-    return [prior for prior in wanted if prior.name in (*parameters.fields, *parameters.derived)]
+    return _known(wanted, [*parameters.fields, *parameters.derived], parameters)
 
 
 def typical(parameters: Parameters, *, pressure_error: float = 0.08) -> list[Prior]:
@@ -184,24 +184,38 @@ def typical(parameters: Parameters, *, pressure_error: float = 0.08) -> list[Pri
     anything between the sea and dry sand. Air is that of the start, ``pressure_error`` of the logarithm for the altitude.
     """
     albedo, asymmetry, exponent = (np.array(column) for column in zip(*AEROSOLS.values(), strict=True))
-    opac, repeated = "Hess et al. 1998, all types", _repeated(parameters)
-    init = parameters.init
-    middle = int(np.argmin(np.abs(np.asarray(init.wavelengths) - REFERENCE_NM)))
-    air = f"rayleigh_optical_depth_{float(init.wavelengths[middle]):g}"
+    opac, init = "Hess et al. 1998, all types", parameters.init
+    middle = _middle(parameters)
+    air = spectral_name("rayleigh_optical_depth", float(init.wavelengths[middle]))
     wanted = [
-        Prior("mie_single_scattering_albedo", float(albedo.mean()), float(albedo.std()) * repeated, source=opac),
+        Prior(
+            _once("mie_single_scattering_albedo", parameters), float(albedo.mean()), float(albedo.std()), source=opac
+        ),
         Prior("mie_g", float(asymmetry.mean()), 0.06, source=f"{opac}, as one Henyey-Greenstein"),
         Prior("mie_angstrom_exponent", float(exponent.mean()), float(exponent.std()), source=opac),
         Prior("mie_scale_height", 1.5, 0.5, True, "a boundary layer"),
         Prior("ozone_column", 300.0, 0.15, True, "Van Heuklon 1979"),
-        Prior("ground_albedo", 0.15, 0.7 * math.sqrt(init.wavelengths.size), True, "sea to sand"),
+        Prior(_once("ground_albedo", parameters), 0.15, 0.7, True, "sea to sand"),
         Prior(air, float(init.rayleigh_optical_depth[middle]), pressure_error, True, "pressure at the place"),
     ]
-    known = {name for one in varying(parameters)[1] for name in (one.name, one.field)}
+    return _known(wanted, varying(parameters)[0], parameters)
+
+
+def _known(wanted: Sequence[Prior], fields: Sequence[str], parameters: Parameters) -> list[Prior]:
+    """Those of ``wanted`` that are of ``fields``."""
+    every = quantities(fields, [float(nm) for nm in parameters.init.wavelengths])
+    known = {name for one in every for name in (one.name, one.field)}
     return [prior for prior in wanted if prior.name in known]
 
 
-def _repeated(parameters: Parameters) -> float:
-    """What the error of one number grows by where it is stated once for every wavelength."""
-    one = "mie_angstrom_exponent" in parameters.derived
-    return math.sqrt(parameters.init.wavelengths.size) if one else 1.0
+def _middle(parameters: Parameters) -> int:
+    return int(np.argmin(np.abs(np.asarray(parameters.init.wavelengths) - REFERENCE_NM)))
+
+
+def _once(field: str, parameters: Parameters) -> str:
+    """A spectral ``field``; or its number nearest to 550 nm where a tie makes it one, so that it counts once."""
+    if field in DERIVED:
+        tied = "mie_angstrom_exponent" in parameters.derived
+    else:
+        tied = any(block.fields == (field,) and block.start.size == 1 for block in parameters.blocks)
+    return spectral_name(field, float(parameters.init.wavelengths[_middle(parameters)])) if tied else field

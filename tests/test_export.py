@@ -170,12 +170,28 @@ def test_files_hold_what_was_computed(tmp_path, s1):
         assert file.channels()["A"].pixels.dtype == np.float16
 
 
+@pytest.mark.parametrize("scale", [1e6, 1e-9])
+def test_half_precision_holds_no_more_than_it_can(scale, tmp_path, s1):
+    """Numbers beyond 65504 would be infinite in it, those below 6e-8 zero: such a texture is there in single precision only."""
+    texels = np.full((1, 2, 2, 3), scale, np.float32)
+    kept = export.Texture("kept", np.ones_like(texels), "none", "1", "nothing")
+    written = export.write([export.Texture("lost", texels, "none", "1", "nothing"), kept], tmp_path, s1, "none")
+    names = {str(path.relative_to(tmp_path)) for path in written}
+    assert names == {"float/lost.exr", "float/kept.exr", "half/kept.exr"}
+    np.testing.assert_array_equal(imageio.read_image(tmp_path / "float" / "lost.exr").pixels, texels[0])
+
+
 def test_the_command(tmp_path, capsys):
     folder = tmp_path / "tables"
-    assert main(["export", "earth", "--luts", "hillaire", "-o", str(folder), "--sun-zenith-deg", "80"]) == 0
+    sun = ["--sun-zenith-deg", "80", "--sun-azimuth-deg", "90"]
+    assert main(["export", "earth", "--luts", "hillaire", "-o", str(folder), *sun]) == 0
     assert "sky_view" in capsys.readouterr().out
     text = (folder / "README.md").read_text()
-    assert "80°" in text
+    assert "zenith angle 80°, azimuth 90° clockwise" in text
+    view = imageio.read_image(folder / "float" / "sky_view.exr").metadata["place"]
+    assert view.startswith("altitude 0.1 km, sun in direction 0.98")
+    assert "projection pinhole" in imageio.read_image(folder / "half" / "aerial_perspective.exr").metadata["place"]
+    assert "place" not in imageio.read_image(folder / "float" / "multiple_scattering.exr").metadata
     assert "@" not in text
     assert len(list((folder / "half" / "aerial_perspective").iterdir())) == 32
     assert main(["export", "earth", "--luts", "hillaire", "-o", str(folder)]) == 2

@@ -156,6 +156,7 @@ def test_light_from_nothing_is_nothing():
         ({"sky_view_size": (192, 107)}, "sky_view_size"),
         ({"multiple_size": (1, 32)}, "multiple_size"),
         ({"steps": Steps(march=0)}, "steps.march"),
+        ({"steps": Steps(directions=1)}, "steps.directions.*at least 2"),
     ],
 )
 def test_sizes_that_cannot_be_are_refused(options, named):

@@ -97,11 +97,24 @@ def test_ozone_climatology():
 def test_aerosol_types_speak_of_what_varies():
     tied = select(earth(), ["mie_scattering", "mie_absorption", "mie_g"], {"mie": "angstrom"})
     assert {p.name for p in priors.aerosol("urban", tied)} == {
-        "mie_single_scattering_albedo",
+        "mie_single_scattering_albedo_550",
         "mie_g",
         "mie_angstrom_exponent",
     }
+    apart = select(earth(), ["mie_scattering", "mie_absorption", "mie_g"])
+    assert {p.name for p in priors.aerosol("urban", apart)} == {"mie_single_scattering_albedo", "mie_g"}
     assert [p.name for p in priors.aerosol("desert", select(earth(), ["mie_g"]))] == ["mie_g"]
+
+
+def test_what_is_one_number_is_known_once():
+    """A ground of one factor and one albedo of the aerosol are told once, to the error they are known to, not for each band."""
+    free = ["mie_scattering", "mie_absorption", "ground_albedo"]
+    errors = lambda tie: {p.name: p.error for p in priors.typical(select(earth(), free, tie))}
+    tied = errors({"mie": "angstrom", "ground_albedo": "start"})
+    assert tied["ground_albedo_550"] == errors({})["ground_albedo"] == 0.7
+    # Standard deviation of the ten types of Hess et al. 1998, table 4.
+    assert tied["mie_single_scattering_albedo_550"] == pytest.approx(0.0595, abs=1e-4)
+    assert "ground_albedo" not in tied
 
 
 @pytest.mark.parametrize(

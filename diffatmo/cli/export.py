@@ -115,8 +115,13 @@ def export(
         written = tables.write(textures, output, air, kind, overwrite=True)
     shown = Table("table", "size", "largest entry", "error of half")
     for texture in textures:
-        error = f"{100 * tables.half_error(texture.texels):.2g} %"
-        shown.add_row(texture.name, _size(texture), f"{texture.texels.max():.4g}", error)
+        error = tables.half_error(texture.texels)
+        told = (
+            f"{100 * error:.2g} %"
+            if error <= tables.HALF_LOST
+            else "not written: beyond its range; scale solar_irradiance"
+        )
+        shown.add_row(texture.name, _size(texture), f"{texture.texels.max():.4g}", told)
     with imageio.atomic_write(output / "README.md", overwrite=True) as path:
         path.write_text(_readme(luts, textures, facts), encoding="utf-8")
     console.print(shown)
@@ -190,6 +195,7 @@ def _hillaire(
         "top": f"{float(air.top_radius):g}",
         "altitude": f"{options['altitude_km']:g}",
         "sun_zenith": f"{options['sun_zenith_deg']:g}",
+        "sun_azimuth": f"{options['sun_azimuth_deg']:g}",
         "camera": ", ".join(f"{key} {value}" for key, value in cameras.to_dict(camera).items()),
         "t_mu": model.transmittance_size[0],
         "t_r": model.transmittance_size[1],

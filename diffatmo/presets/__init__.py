@@ -159,7 +159,9 @@ class SkyLoss(NamedTuple):
 
     def __str__(self) -> str:
         sun = f"sky, sun {self.sun_zenith_deg:g} degrees from the zenith"
-        return f"{sun}: {100 * self.rms:.2g} % RMS, {100 * self.largest:+.2g} % at most"
+        # Two digits, but 100 and not 1e+02.
+        rms, largest = (float(f"{100 * value:.2g}") for value in (self.rms, self.largest))
+        return f"{sun}: {rms:g} % RMS, {largest:+g} % at most"
 
 
 def _shown(value: tuple[float, ...] | str) -> str:

@@ -47,8 +47,10 @@ class Hillaire(Model):
         if self.sky_view_size[1] < 4 or self.sky_view_size[1] % 2:
             raise ValueError(f"sky_view_size: got {self.sky_view_size[1]} rows, expected an even number of at least 4")
         for name, count in self.steps._asdict().items():
-            if count < 1:
-                raise ValueError(f"steps.{name}: got {count}, expected at least 1")
+            # A single direction would be a horizontal one, along which next to no light leaves: f_ms is 1.
+            least = 2 if name == "directions" else 1
+            if count < least:
+                raise ValueError(f"steps.{name}: got {count}, expected at least {least}")
 
     def sky(self, atmosphere: Atmosphere) -> "HillaireSky":
         """Compute the tables that do not depend on the camera."""
