@@ -271,6 +271,11 @@ def test_nothing_is_replaced_unless_asked(tmp_path):
     (out / "a" / results.RECORD).write_text("mine")
     with pytest.raises(folders.FolderError, match="holds results already"):
         fit(files, out)
+    # Nor is a fit of one image joined by those of a folder.
+    (tmp_path / "one").mkdir()
+    (tmp_path / "one" / results.RECORD).write_text("mine")
+    with pytest.raises(folders.FolderError, match="holds results already"):
+        fit(files, tmp_path / "one")
     (out / results.FILE).write_text("mine")
     with pytest.raises(InputError, match="--resume to go on, or --overwrite"):
         fit(files, out)

@@ -145,8 +145,8 @@ def _check_free(output: Path, tasks: Sequence[Task]) -> None:
         raise InputError(
             f"{output}: holds results already ({results.FILE}); choose another folder, --resume to go on, or --overwrite"
         )
-    for task in tasks:
-        folders.check_free(task.directory, names=(results.RECORD, origin.FILE))
+    for directory in (output, *(task.directory for task in tasks)):
+        folders.check_free(directory, names=(results.RECORD, origin.FILE))
 
 
 @dataclass
