@@ -107,7 +107,7 @@ def enter_atmosphere(
     return (
         altitude_there,
         jnp.where(misses, 1.0, jnp.clip(mu_there, -1, 1)),
-        jnp.where(misses, mu_s, mu_s_there),
+        jnp.where(misses, mu_s, jnp.clip(mu_s_there, -1, 1)),
         distance,
         misses,
     )

@@ -89,6 +89,16 @@ def test_a_ray_from_space_enters_at_the_top(x64):
     assert not geometry.enter_atmosphere(jnp.asarray(h), limb - 1e-9, *(jnp.zeros(()),) * 2, radius, top)[4]
 
 
+@pytest.mark.parametrize("mu_s", [-1.0, 1.0])
+def test_cosines_are_cosines_after_a_long_way(mu_s):
+    """From ten thousand radii away float32 rounds the cosines at the top of a small planet by a percent: not beyond 1."""
+    entered = geometry.enter_atmosphere(
+        *map(jnp.float32, (1e5, -1.0, mu_s, -mu_s)), jnp.float32(10.0), jnp.float32(100.0)
+    )
+    assert entered[1] == -1
+    assert abs(entered[2]) <= 1
+
+
 @pytest.mark.parametrize("mu", [-1.0, -0.5, 0.0, 0.5, 1.0])
 @pytest.mark.parametrize("h", [0.0, 1.0, 100.0])
 def test_derivatives_are_finite(x64, h, mu):
