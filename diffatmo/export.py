@@ -4,6 +4,7 @@ A texture has the axes (depth, height, width, channels), entry by entry as the m
 Entries lie at the centres of texels: position p of n entries is the texture coordinate (p + ½) / n.
 """
 
+import shutil
 from pathlib import Path
 from typing import NamedTuple
 
@@ -142,6 +143,10 @@ def write(
         for texture in textures:
             error = half_error(texture.texels)
             if precision == "half" and error > HALF_LOST:
+                if overwrite:
+                    # What an earlier run has left would pass for this one's.
+                    (folder / f"{texture.name}.exr").unlink(missing_ok=True)
+                    shutil.rmtree(folder / texture.name, ignore_errors=True)
                 continue
             depth, height, width, channels = texture.texels.shape
             about: dict[str, imageio.Attribute] = {

@@ -175,7 +175,10 @@ def test_half_precision_holds_no_more_than_it_can(scale, tmp_path, s1):
     """Numbers beyond 65504 would be infinite in it, those below 6e-8 zero: such a texture is there in single precision only."""
     texels = np.full((1, 2, 2, 3), scale, np.float32)
     kept = export.Texture("kept", np.ones_like(texels), "none", "1", "nothing")
-    written = export.write([export.Texture("lost", texels, "none", "1", "nothing"), kept], tmp_path, s1, "none")
+    lost = export.Texture("lost", texels, "none", "1", "nothing")
+    export.write([lost._replace(texels=texels / scale)], tmp_path, s1, "none")
+    written = export.write([lost, kept], tmp_path, s1, "none", overwrite=True)
+    assert not (tmp_path / "half" / "lost.exr").exists()
     names = {str(path.relative_to(tmp_path)) for path in written}
     assert names == {"float/lost.exr", "float/kept.exr", "half/kept.exr"}
     np.testing.assert_array_equal(imageio.read_image(tmp_path / "float" / "lost.exr").pixels, texels[0])

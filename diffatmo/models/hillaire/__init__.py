@@ -47,7 +47,7 @@ class Hillaire(Model):
         if self.sky_view_size[1] < 4 or self.sky_view_size[1] % 2:
             raise ValueError(f"sky_view_size: got {self.sky_view_size[1]} rows, expected an even number of at least 4")
         for name, count in self.steps._asdict().items():
-            # A single direction would be a horizontal one, along which next to no light leaves: f_ms is 1.
+            # A single direction would be a horizontal one, along which next to no light leaves: f_ms is nearly 1.
             least = 2 if name == "directions" else 1
             if count < least:
                 raise ValueError(f"steps.{name}: got {count}, expected at least {least}")
