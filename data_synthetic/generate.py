@@ -94,12 +94,16 @@ def towards(zenith_deg: float) -> Direction:
 
 
 def trace(
-    truth: atmosphere.Atmosphere, zenith_deg: float, seed: int, samples: int = SAMPLES
+    truth: atmosphere.Atmosphere,
+    zenith_deg: float,
+    seed: int,
+    samples: int = SAMPLES,
+    of: Equirectangular | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and standard error of a picture, without the noise of a sensor."""
+    """Mean and standard error of a picture, without the noise of a sensor; by the camera of all pictures, or another."""
     sky = PathTrace(samples=samples, seed=seed).sky(truth)
     mean, error, _ = sky.radiance_with_error(
-        altitude=jnp.asarray(ALTITUDE_KM), view=camera().directions(), sun=towards(zenith_deg)
+        altitude=jnp.asarray(ALTITUDE_KM), view=(of or camera()).directions(), sun=towards(zenith_deg)
     )
     return np.asarray(mean, float), np.asarray(error, float)
 
