@@ -44,18 +44,16 @@ def altitude_along(altitude: Altitude, mu: Cosine, distance: Length, bottom_radi
     return altitude + step / (r + safe_sqrt(r * r + step))
 
 
-def mu_along(altitude: Altitude, mu: Cosine, distance: Length, bottom_radius: Scalar) -> Cosine:
-    """Cosine of the ray's zenith angle after ``distance`` km along it."""
-    r_there = bottom_radius + altitude_along(altitude, mu, distance, bottom_radius)
-    return ((bottom_radius + altitude) * mu + distance) / r_there
+def mu_along(altitude: Altitude, mu: Cosine, distance: Length, there: Altitude, bottom_radius: Scalar) -> Cosine:
+    """Cosine of the ray's zenith angle after ``distance`` km along it, at the altitude ``there``."""
+    return ((bottom_radius + altitude) * mu + distance) / (bottom_radius + there)
 
 
 def mu_s_along(
-    altitude: Altitude, mu: Cosine, mu_s: Cosine, nu: Cosine, distance: Length, bottom_radius: Scalar
+    altitude: Altitude, mu_s: Cosine, nu: Cosine, distance: Length, there: Altitude, bottom_radius: Scalar
 ) -> Cosine:
-    """Cosine of the sun's zenith angle after ``distance`` km along the ray."""
-    r_there = bottom_radius + altitude_along(altitude, mu, distance, bottom_radius)
-    return ((bottom_radius + altitude) * mu_s + distance * nu) / r_there
+    """Cosine of the sun's zenith angle after ``distance`` km along the ray, at the altitude ``there``."""
+    return ((bottom_radius + altitude) * mu_s + distance * nu) / (bottom_radius + there)
 
 
 def distance_up(altitude: Altitude, mu: Cosine, target: Altitude, bottom_radius: Scalar) -> Length:

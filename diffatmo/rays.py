@@ -108,14 +108,29 @@ def trace(
     steps: int,
     crossings: tuple[Length, Length] | None = None,
 ) -> Nodes:
-    """Nodes from a start inside the atmosphere to the end of the ray, in pieces of ``steps`` nodes each.
+    """Nodes from a start inside the atmosphere to the end of the ray: :func:`place` by Gauss's rule of ``steps`` nodes."""
+    s, w, _ = rule(steps, jnp.result_type(mu).name)
+    by_piece = place(altitude, mu, ground, radius, top_altitude, s, w, crossings)
+    return Nodes(*(part.reshape(*part.shape[:-2], -1) for part in by_piece))
+
+
+def place(
+    altitude: Altitude,
+    mu: Cosine,
+    ground: Bool[Array, "..."],
+    radius: Scalar,
+    top_altitude: Altitude,
+    s: Float[np.ndarray, "... n"],
+    w: Float[np.ndarray, "... n"],
+    crossings: tuple[Length, Length] | None = None,
+) -> Nodes:
+    """Nodes at positions ``s``, with weights ``w``, of [0, 1] on every piece of a ray; pieces have an axis before the nodes'.
 
     Without ``crossings`` two pieces: one on either side of the perigee, or of the middle of a ray that only rises or only
     falls (onto the ``ground``). With ``crossings``, two distances (km, negative for none) at which the integrand jumps,
     four pieces: each of the two is cut once more, and the cuts fall on the crossings.
     """
     altitude, mu, top = jnp.broadcast_arrays(altitude, mu, top_altitude)
-    s, w, _ = rule(steps, mu.dtype.name)
     stretch = STRETCH * top
     perigee = geometry.perigee_altitude(altitude, mu, radius)
     r_mu = (radius + altitude) * mu
@@ -164,8 +179,7 @@ def trace(
     position = jnp.where(sign[..., None] > 0, s, 1 - s)
     h, z, slope = _piece(low, high, v_low, perigee[..., None], radius, stretch[..., None, None], position)
     distance = jnp.maximum(sign[..., None] * z - r_mu[..., None, None], 0)
-    flat = (*mu.shape, len(pieces) * steps)
-    return Nodes(h.reshape(flat), distance.reshape(flat), (slope * w).reshape(flat))
+    return Nodes(h, distance, slope * w)
 
 
 def straight(altitude: Altitude, mu: Cosine, length: Length, radius: Scalar, steps: int) -> Nodes:

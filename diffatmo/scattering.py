@@ -52,7 +52,7 @@ def integrate(
         nodes = rays.trace(altitude, mu, ground, radius, atmosphere.top_altitude, steps, crossings)
     along, end = transmittance.columns_along(atmosphere, altitude, mu, nodes, steps)
     mu_s_here = geometry.mu_s_along(
-        altitude[..., None], mu[..., None], mu_s[..., None], nu[..., None], nodes.distance, radius
+        altitude[..., None], mu_s[..., None], nu[..., None], nodes.distance, nodes.altitude, radius
     )
     towards_sun, free = transmittance.to_top(atmosphere, nodes.altitude, mu_s_here)
     depth = transmittance.spectral_depth(atmosphere, jax.tree.map(jnp.add, along, towards_sun))

@@ -9,6 +9,7 @@ form, so no table is needed: the exponential's is Chapman's function, the absorb
 import math
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -169,6 +170,12 @@ def columns_along(
     atmosphere: Atmosphere, altitude: Altitude, mu: Cosine, nodes: rays.Nodes, steps: int
 ) -> tuple[Columns, Columns]:
     """Columns from the start of a ray to each of its nodes, and to its end."""
+    both = columns_to(atmosphere, altitude, mu, nodes, steps)
+    return jax.tree.map(lambda x: x[..., :-1], both), jax.tree.map(lambda x: x[..., -1], both)
+
+
+def columns_to(atmosphere: Atmosphere, altitude: Altitude, mu: Cosine, nodes: rays.Nodes, steps: int) -> Columns:
+    """The same in one: to the nodes and, last, to the end."""
     radius = atmosphere.bottom_radius
     perigee = geometry.perigee_altitude(altitude, mu, radius)
     start = (radius + altitude) * mu
@@ -178,7 +185,7 @@ def columns_along(
     length = jnp.sum(nodes.weight, axis=-1, keepdims=True)
     ends = start[..., None] + jnp.concatenate([nodes.distance, length], axis=-1)
     ramps = ramp_columns(tops, perigee[..., None], start[..., None], ends, radius)
-    return Columns(inside, ramps[..., :-1]), Columns(whole, ramps[..., -1])
+    return Columns(jnp.concatenate([inside, whole[..., None]], axis=-1), ramps)
 
 
 def along(atmosphere: Atmosphere, altitude: Altitude, mu: Cosine, distance: Length, steps: int = 48) -> Transmittance:

@@ -14,8 +14,9 @@ def everything(x):
     h, mu = x
     ground = geometry.hits_ground(h, mu, 6360.0)
     d = geometry.distance_to_boundary(h, mu, ground, 6360.0, 100.0)
+    there = geometry.altitude_along(h, mu, d, 6360.0)
     return jnp.stack([
-        d, geometry.altitude_along(h, mu, 0.5 * d, 6360.0), geometry.mu_along(h, mu, d, 6360.0),
+        d, geometry.altitude_along(h, mu, 0.5 * d, 6360.0), geometry.mu_along(h, mu, d, there, 6360.0),
         geometry.perigee_altitude(h, mu, 6360.0), geometry.horizon_mu(h, 6360.0), geometry.sine(mu),
     ])  # fmt: skip
 
@@ -55,11 +56,11 @@ def test_along_a_ray_is_consistent(x64, radius):
     """Walk a distance, then walk back: same altitude, opposite mu; nu is conserved by construction of mu_s."""
     h, mu, mu_s, nu, d = 12.0, -0.03, 0.2, 0.5, 150.0
     h2 = geometry.altitude_along(h, mu, d, radius)
-    mu2 = geometry.mu_along(h, mu, d, radius)
-    mu_s2 = geometry.mu_s_along(h, mu, mu_s, nu, d, radius)
+    mu2 = geometry.mu_along(h, mu, d, h2, radius)
+    mu_s2 = geometry.mu_s_along(h, mu_s, nu, d, h2, radius)
     assert float(geometry.altitude_along(h2, -mu2, d, radius)) == pytest.approx(h, abs=1e-9)
-    assert float(geometry.mu_along(h2, -mu2, d, radius)) == pytest.approx(-mu, abs=1e-12)
-    assert float(geometry.mu_s_along(h2, -mu2, mu_s2, -nu, d, radius)) == pytest.approx(mu_s, abs=1e-12)
+    assert float(geometry.mu_along(h2, -mu2, d, h, radius)) == pytest.approx(-mu, abs=1e-12)
+    assert float(geometry.mu_s_along(h2, mu_s2, -nu, d, h, radius)) == pytest.approx(mu_s, abs=1e-12)
     # The perigee is a property of the line, not of the point on it.
     p = float(geometry.perigee_altitude(h, mu, radius))
     assert float(geometry.perigee_altitude(h2, mu2, radius)) == pytest.approx(p, abs=1e-9)

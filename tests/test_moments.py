@@ -210,3 +210,9 @@ def test_thin_shells_and_far_observers_are_finite():
         assert bool((value >= 0).all()), place
         assert bool((value[1] > 0).all()), place
         assert all(bool(jnp.isfinite(slope).all()) for slope in slopes), place
+
+
+def test_rays_that_are_followed_together_have_as_many_steps():
+    directions = Directions(sky=5, ground=4, azimuths=4, steps=6, degree=3)
+    with pytest.raises(ValueError, match=r"iterate and last: .* 6 and 5 steps; expected as many"):
+        Moments(iterate=directions)

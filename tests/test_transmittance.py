@@ -97,7 +97,7 @@ def test_shadow_crossing_lies_on_the_edge(x64):
     h, mu, mu_s, nu = (jnp.asarray(x) for x in (0.5, 0.3, -0.05, 0.2))
     _, leaves = rays.shadow_crossings(h, mu, mu_s, nu, radius)
     there = geometry.altitude_along(h, mu, leaves, radius)
-    mu_s_there = geometry.mu_s_along(h, mu, mu_s, nu, leaves, radius)
+    mu_s_there = geometry.mu_s_along(h, mu_s, nu, leaves, there, radius)
     assert float(leaves) > 0
     assert float(mu_s_there) == pytest.approx(float(geometry.horizon_mu(there, radius)), abs=1e-9)
     # High sun: no shadow anywhere on the ray.

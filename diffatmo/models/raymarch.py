@@ -61,9 +61,7 @@ def naive(
     ds = length[..., None] / steps
     distance = (jnp.arange(steps) + 0.5) * ds
     here = geometry.altitude_along(altitude[..., None], mu[..., None], distance, radius)
-    mu_s_here = geometry.mu_s_along(
-        altitude[..., None], mu[..., None], mu_s[..., None], nu[..., None], distance, radius
-    )
+    mu_s_here = geometry.mu_s_along(altitude[..., None], mu_s[..., None], nu[..., None], distance, here, radius)
     columns = densities(here) * ds
     along = jnp.cumsum(columns, axis=-1)
     dl = (geometry.distance_up(here, mu_s_here, top, radius) / light_steps)[..., None]

@@ -54,6 +54,13 @@ class Moments(Model):
     view_columns: int = 16
     view_fine_columns: int = 32
 
+    def __check_init__(self) -> None:
+        if self.iterate.steps != self.last.steps:
+            raise ValueError(
+                f"iterate and last: their rays are followed together, with {self.iterate.steps} and {self.last.steps} steps; "
+                "expected as many"
+            )
+
     @classmethod
     def coarse(cls) -> "Moments":
         """Twice as fast, and off by 0.5 % RMS by day and at dusk: for photographs, which are known no better."""

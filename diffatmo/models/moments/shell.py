@@ -1,15 +1,19 @@
 """Geometry of the iteration: where the nodes are and how rays connect them. Depends on the planet's radii only."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from diffatmo import geometry, rays, table
 from diffatmo._types import Altitude, Cosine, Scalar
-from diffatmo.models.moments.angular import cosines, orders, plane, polar, projection, relative_nu
+from diffatmo.models.moments.angular import cosines, orders, pairs, plane, polar, projection, relative_nu
 from diffatmo.numerics import gauss_legendre, safe_divide
+from diffatmo.rays import Nodes
 
 ALTITUDE_LINEAR = 0.04
 """Linear part of the map of altitude nodes (clusters them in the aerosol layer)."""
@@ -47,56 +51,11 @@ class Rays(eqx.Module):
     sun_scale: Float[Array, "lm j"]
     """sin^-m θ_s."""
     ground: Bool[Array, " k"]
-    nodes: rays.Nodes
+    nodes: Nodes
     mu_s_here: Float[Array, "i k n p j"]
     mu_s_ground: Float[Array, "i g p j"]
     azimuths: int = eqx.field(static=True)
     steps: int = eqx.field(static=True)
-
-    @classmethod
-    def build(
-        cls,
-        altitude: Float[Array, " i"],
-        mu_s: Float[Array, " j"],
-        radius: Scalar,
-        top: Altitude,
-        count: Directions,
-    ) -> "Rays":
-        """Gauss-Legendre directions on either side of each node's horizon, and the ray into each of them."""
-        horizon = geometry.horizon_mu(altitude, radius)[:, None]
-        mus, weights = [], []
-        for number, span in ((count.sky, 1 - horizon), (count.ground, -1 - horizon)):
-            unit, w = gauss_legendre(number)
-            slope = DIRECTION_LINEAR + 2 * (1 - DIRECTION_LINEAR) * unit
-            mus.append(horizon + span * table.stretch(jnp.asarray(unit, altitude.dtype), DIRECTION_LINEAR))
-            weights.append(jnp.abs(span) * jnp.asarray(w * slope, altitude.dtype))
-        mu, solid_angle = jnp.concatenate(mus, axis=1), jnp.concatenate(weights, axis=1)
-        ground = jnp.arange(count.sky + count.ground) >= count.sky
-        start = jnp.broadcast_to(altitude[:, None], mu.shape)
-        nodes = rays.trace(start, mu, jnp.broadcast_to(ground, mu.shape), radius, top, count.steps)
-        nu = relative_nu(mu[..., None, None], mu_s, cosines(count.azimuths, altitude.dtype)[:, None])
-        mu_s_here = geometry.mu_s_along(
-            start[..., None, None, None], mu[..., None, None, None], mu_s, nu[:, :, None],
-            nodes.distance[..., None, None], radius,
-        )  # fmt: skip
-        reach = jnp.sum(nodes.weight, axis=-1)[:, count.sky :, None, None]
-        r_mu_s = (radius + altitude)[:, None, None, None] * mu_s
-        mu_s_ground = (r_mu_s + reach * nu[:, count.sky :]) / radius
-        powers = [jnp.ones_like(mu_s)]
-        for _ in range(count.degree):
-            powers.append(powers[-1] / geometry.sine(mu_s))
-        return cls(
-            mu,
-            solid_angle,
-            solid_angle[..., None] * projection(count.degree, mu),
-            jnp.stack(powers)[orders(count.degree)],
-            ground,
-            nodes,
-            mu_s_here,
-            jnp.clip(mu_s_ground, -1, 1),
-            count.azimuths,
-            count.steps,
-        )
 
 
 class Ways(NamedTuple):
@@ -188,32 +147,130 @@ def dusk(mu_s: Cosine, scale: Scalar) -> Float[Array, "..."]:
     return jnp.exp(-jnp.minimum(depth * depth / (1 + depth / 4), 36))
 
 
-def _link(
+class _Bundle(NamedTuple):
+    """Rays of several sets of directions as one, so that the compiler has to see their geometry once.
+
+    All pieces have as many places for nodes as those of the set with the most; the ``k`` axis holds one set after another.
+    """
+
+    mu: Float[Array, "i k"]
+    solid_angle: Float[Array, "i k"]
+    nodes: Nodes
+    """Axes i, k, piece, place."""
+
+    @classmethod
+    def trace(
+        cls, altitude: Float[Array, " i"], radius: Scalar, top: Altitude, counts: Sequence[Directions]
+    ) -> "_Bundle":
+        """Gauss-Legendre directions on either side of each node's horizon, and the ray into each of them."""
+        dtype = altitude.dtype
+        sides = [gauss_legendre(number) for count in counts for number in (count.sky, count.ground)]
+        unit, w = (jnp.asarray(np.concatenate(parts), dtype) for parts in zip(*sides, strict=True))
+        ground = np.concatenate([np.arange(count.sky + count.ground) >= count.sky for count in counts])
+        horizon = geometry.horizon_mu(altitude, radius)[:, None]
+        span = jnp.where(ground, -1, 1) - horizon
+        slope = DIRECTION_LINEAR + 2 * (1 - DIRECTION_LINEAR) * unit
+        mu = horizon + span * table.stretch(unit, DIRECTION_LINEAR)
+        places = np.zeros((2, len(ground), 1, max(count.steps for count in counts)), dtype)
+        for count, rows in zip(counts, _parts(counts), strict=True):
+            places[:, rows, :, : count.steps] = np.stack(rays.rule(count.steps, dtype.name)[:2])[:, None, None]
+        start = jnp.broadcast_to(altitude[:, None], mu.shape)
+        nodes = rays.place(start, mu, jnp.broadcast_to(ground, mu.shape), radius, top, *places)
+        return cls(mu, jnp.abs(span) * w * slope, nodes)
+
+
+def _parts(counts: Sequence[Directions]) -> list[slice]:
+    """Where each set lies on the axis of all directions."""
+    ends = np.cumsum([count.sky + count.ground for count in counts])
+    return [slice(end - count.sky - count.ground, end) for count, end in zip(counts, ends, strict=True)]
+
+
+def _at_nodes(places: Float[Array, "i k piece place ..."], steps: int) -> Float[Array, "i k n ..."]:
+    """What stands at the nodes of a set with so many on each piece."""
+    i, k, pieces, _, *more = places.shape
+    return places[:, :, :, :steps].reshape(i, k, pieces * steps, *more)
+
+
+def _rays(
+    altitude: Float[Array, " i"],
+    mu_s: Float[Array, " j"],
+    radius: Scalar,
+    bundle: _Bundle,
+    counts: Sequence[Directions],
+) -> list[Rays]:
+    """Each set of a bundle, with the sun's height along its rays."""
+    most = max(count.degree for count in counts)
+    project = bundle.solid_angle[..., None] * projection(most, bundle.mu)
+    powers = [jnp.ones_like(mu_s)]
+    for _ in range(most):
+        powers.append(powers[-1] / geometry.sine(mu_s))
+    sun_scale = jnp.stack(powers)[orders(most)]
+    found = []
+    for count, part in zip(counts, _parts(counts), strict=True):
+        nodes = Nodes(*(_at_nodes(places[:, part], count.steps) for places in bundle.nodes))
+        mu, moments = bundle.mu[:, part], len(pairs(count.degree))
+        nu = relative_nu(mu[..., None, None], mu_s, cosines(count.azimuths, altitude.dtype)[:, None])
+        along = nodes.distance[..., None, None], nodes.altitude[..., None, None], radius
+        start = altitude[:, None, None, None]
+        mu_s_here = geometry.mu_s_along(start[..., None], mu_s, nu[:, :, None], *along)
+        reach = jnp.sum(nodes.weight, axis=-1)[:, count.sky :, None, None]
+        mu_s_ground = geometry.mu_s_along(start, mu_s, nu[:, count.sky :], reach, jnp.zeros_like(start), radius)
+        found.append(
+            Rays(
+                mu,
+                bundle.solid_angle[:, part],
+                project[:, part, :moments],
+                sun_scale[:moments],
+                jnp.arange(count.sky + count.ground) >= count.sky,
+                nodes,
+                mu_s_here,
+                jnp.clip(mu_s_ground, -1, 1),
+                count.azimuths,
+                count.steps,
+            )
+        )
+    return found
+
+
+def _links(
     altitude: Float[Array, " i"],
     mu_s: Float[Array, " j"],
     radius: Scalar,
     top: Altitude,
-    count: Directions,
-    degree: int,
-) -> Links:
-    """Rays, and the links that take moments of ``degree`` along them."""
-    r = Rays.build(altitude, mu_s, radius, top, count)
-    start = jnp.broadcast_to(altitude[:, None, None], r.nodes.altitude.shape)
-    mu_here = geometry.mu_along(start, r.mu[..., None], r.nodes.distance, radius)
-    nu = relative_nu(r.mu[..., None, None], mu_s, cosines(count.azimuths, altitude.dtype)[:, None])
-    scale = grazing(radius, top)
-    ground_rows = table.cubic_rows(sun_unit(r.mu_s_ground, radius, top), mu_s.size, axis=2)
-    return Links(
-        rays=r,
-        ways=Ways(
-            table.cubic_rows(altitude_unit(r.nodes.altitude, top), altitude.size),
-            sun_unit(r.mu_s_here, radius, top),
-            dusk(r.mu_s_here, scale),
-            *plane(mu_here[..., None, None], r.mu_s_here, nu[:, :, None]),
-        ),
-        polar=polar(degree, mu_here),
-        ground_rows=ground_rows * dusk(r.mu_s_ground, scale)[:, :, None],
+    bundle: _Bundle,
+    sets: Sequence[Rays],
+    degrees: Sequence[int],
+) -> list[Links]:
+    """The last sets of a bundle, and the links that take moments of the given degrees along each of them."""
+    skipped = bundle.mu.shape[1] - sum(r.mu.shape[1] for r in sets)
+    here = jax.tree.map(lambda x: x[:, skipped:], bundle)
+    mu_here = geometry.mu_along(
+        altitude[:, None, None, None], here.mu[..., None, None], here.nodes.distance, here.nodes.altitude, radius
     )
+    altitude_rows = table.cubic_rows(altitude_unit(here.nodes.altitude, top), altitude.size)
+    angular = polar(max(degrees), mu_here)
+    # The sun's height at every node of every set, then at the ground.
+    suns = [part for r in sets for part in (r.mu_s_here, r.mu_s_ground)]
+    flat = jnp.concatenate([part.reshape(altitude.size, -1, mu_s.size) for part in suns], axis=1)
+    ends = np.cumsum([part[0, ..., 0].size for part in suns])[:-1]
+    units, dusks = (
+        [part.reshape(sun.shape) for part, sun in zip(jnp.split(x, ends, axis=1), suns, strict=True)]
+        for x in (sun_unit(flat, radius, top), dusk(flat, grazing(radius, top)))
+    )
+    found, first = [], 0
+    for number, (r, degree) in enumerate(zip(sets, degrees, strict=True)):
+        part = slice(first, first + r.mu.shape[1])
+        first = part.stop
+        unit, unit_ground, dusk_here, dusk_ground = (x[2 * number + at] for x in (units, dusks) for at in (0, 1))
+        nu = relative_nu(r.mu[..., None, None], mu_s, cosines(r.azimuths, altitude.dtype)[:, None])
+        there = _at_nodes(mu_here[:, part], r.steps)[..., None, None]
+        ways = Ways(
+            _at_nodes(altitude_rows[:, part], r.steps), unit, dusk_here, *plane(there, r.mu_s_here, nu[:, :, None])
+        )
+        angular_here = _at_nodes(angular[:, part, ..., : len(pairs(degree))], r.steps)
+        ground_rows = table.cubic_rows(unit_ground, mu_s.size, axis=2) * dusk_ground[:, :, None]
+        found.append(Links(rays=r, ways=ways, polar=angular_here, ground_rows=ground_rows))
+    return found
 
 
 def build(
@@ -232,14 +289,17 @@ def build(
     low, high = sun_range(bottom_radius, top_altitude)
     scale = grazing(bottom_radius, top_altitude)
     mu_s = scale * jnp.sinh(jnp.linspace(0, 1, suns) * (high - low) + low)
-    planet = altitude, mu_s, bottom_radius, top_altitude
+    counts = first, iterate, last
+    bundle = _Bundle.trace(altitude, bottom_radius, top_altitude, counts)
+    once, *sets = _rays(altitude, mu_s, bottom_radius, bundle, counts)
+    again, finally_ = _links(altitude, mu_s, bottom_radius, top_altitude, bundle, sets, (iterate.degree, source_degree))
     return Shell(
         altitude=altitude,
         mu_s=mu_s,
         dusk=dusk(mu_s, scale),
-        first=Rays.build(*planet, first),
-        iterate=_link(*planet, iterate, iterate.degree),
-        last=_link(*planet, last, source_degree),
+        first=once,
+        iterate=again,
+        last=finally_,
         bottom_radius=bottom_radius,
         top_altitude=top_altitude,
     )

@@ -63,10 +63,9 @@ class MomentsSky(Sky):
         light = scattering.radiance(atmosphere, single, nu)
         for phase_, term in zip(self.aureole_phases(nu), single.aureole, strict=True):
             light = light + phase_[..., None] * term
-        mu_here = geometry.mu_along(altitude[..., None], mu[..., None], nodes.distance, radius)
-        mu_s_here = geometry.mu_s_along(
-            altitude[..., None], mu[..., None], mu_s[..., None], nu[..., None], nodes.distance, radius
-        )
+        along = nodes.distance, nodes.altitude, radius
+        mu_here = geometry.mu_along(altitude[..., None], mu[..., None], *along)
+        mu_s_here = geometry.mu_s_along(altitude[..., None], mu_s[..., None], nu[..., None], *along)
         i, count, w, j = self.state.moments.shape
         by_position = jnp.moveaxis(self.state.moments, -1, 1).reshape(i, j, count * w)
         position = self.shell.altitude_unit(nodes.altitude), self.shell.sun_unit(mu_s_here)
@@ -230,10 +229,9 @@ class MomentsView(View):
         size, shell = sky.resolution, sky.shell
         radius, top = sky.atmosphere.bottom_radius, sky.atmosphere.top_altitude
         nodes = rays.trace(altitude, mu, ground, radius, top, size.steps)
-        at = (altitude[:, None, None], mu[:, None, None])
-        distance = nodes.distance[..., None]
-        mu_here = geometry.mu_along(*at, distance, radius)
-        mu_s_here = geometry.mu_s_along(*at, mu_s[:, None], nu[:, None], distance, radius)
+        start, along = altitude[:, None, None], (nodes.distance[..., None], nodes.altitude[..., None], radius)
+        mu_here = geometry.mu_along(start, mu[:, None, None], *along)
+        mu_s_here = geometry.mu_s_along(start, mu_s[:, None], nu[:, None], *along)
         altitude_rows = table.cubic_rows(shell.altitude_unit(nodes.altitude), shell.altitude.size)
         ways = Ways(
             altitude_rows,

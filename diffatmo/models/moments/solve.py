@@ -119,8 +119,9 @@ def _first_order_at(
     """∫ L cos(m φ) dφ at one altitude."""
     k, n, p, j = mu_s_here.shape
     start = jnp.broadcast_to(altitude, mu.shape)
-    along, end = transmittance.columns_along(atmosphere, start, mu, nodes, n // PIECES)
-    view = jnp.exp(-transmittance.optical_depth(atmosphere, along)) * nodes.weight[..., None]
+    columns = transmittance.columns_to(atmosphere, start, mu, nodes, n // PIECES)
+    survives = jnp.exp(-transmittance.optical_depth(atmosphere, columns))
+    view = survives[:, :-1] * nodes.weight[..., None]
     # Few axes, long inside, wavelengths outside: short inner axes would cost the vector units.
     # The last rows are the points where rays meet the ground.
     mu_s_flat = jnp.concatenate([mu_s_here.reshape(k * n, p * j), mu_s_ground.reshape(-1, p * j)])
@@ -144,8 +145,7 @@ def _first_order_at(
     by_order = sum(jnp.sum(turned[c] * smooth[:, :, c], axis=3) for c in range(2))
     sunlit = jnp.maximum(mu_s_ground, 0) * sunlight[:, k * n :].reshape(-1, *mu_s_ground.shape)
     sky = k - mu_s_ground.shape[0]
-    survives = jnp.exp(-transmittance.spectral_depth(atmosphere, end))[:, sky:, None, None]
-    reflected = (atmosphere.ground_albedo / jnp.pi)[:, None, None, None] * survives * sunlit
+    reflected = (atmosphere.ground_albedo / jnp.pi * survives[sky:, -1]).T[..., None, None] * sunlit
     reflected = jnp.tensordot(reflected, to_fine.T @ harmonics, axes=(2, 0)).transpose(3, 1, 0, 2)
     return by_order + _below(reflected, sky, axis=1)
 
@@ -190,31 +190,32 @@ class _Transport(eqx.Module):
     """Degrees to which single scattering and further light are known."""
 
     @classmethod
-    def build(cls, atmosphere: Atmosphere, shell: Shell, links: Links, first: int, further: int) -> "_Transport":
-        """Prepare for single scattering known to degree ``first`` and all other light to degree ``further``."""
-        r = links.rays
-        start = jnp.broadcast_to(shell.altitude[:, None], r.mu.shape)
+    def build(cls, atmosphere: Atmosphere, shell: Shell, first: tuple[int, int], further: int) -> list["_Transport"]:
+        """For the iteration and for the last gather: single scattering known to so many degrees, the rest to one."""
+        sets = shell.iterate, shell.last
+        # The rays of both as one: the compiler sees the formulas once.
+        mu = jnp.concatenate([links.rays.mu for links in sets], axis=1)
+        nodes = jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=1), *(links.rays.nodes for links in sets))
+        start = jnp.broadcast_to(shell.altitude[:, None], mu.shape)
         # The moments of a forward peak are alike; of a backward one every second is negative, and there is nothing to take out.
         moments = phase.mie_moments(atmosphere.mie_g, further + 1, atmosphere.mie_phase)
         peak = jnp.maximum(jnp.minimum(moments[-2], moments[-1]), 0)
         thin = eqx.tree_at(lambda a: a.mie_scattering, atmosphere, (1 - peak) * atmosphere.mie_scattering)
-        along, end = transmittance.columns_along(atmosphere, start, r.mu, r.nodes, r.steps)
-        view = (jnp.exp(-transmittance.optical_depth(thin, along)) * r.nodes.weight[..., None])[..., None, :]
-        survives = jnp.exp(-transmittance.optical_depth(thin, end))[:, r.mu.shape[1] - r.mu_s_ground.shape[1] :]
-
-        def weight(degree: int, peak: Scalar | float) -> Float[Array, "i k n c w"]:
-            source = source_moments(atmosphere, r.nodes.altitude, degree, peak)[..., degrees(degree), :]
-            return view * source * links.polar[..., : len(pairs(degree)), None]
-
-        return cls(
-            shell,
-            links,
-            atmosphere.ground_albedo,
-            weight(first, 0.0),
-            weight(further, peak),
-            survives,
-            (first, further),
-        )
+        columns = transmittance.columns_to(atmosphere, start, mu, nodes, shell.last.rays.steps)
+        survives = jnp.exp(-transmittance.optical_depth(thin, columns))
+        view = (survives[:, :, :-1] * nodes.weight[..., None])[..., None, :]
+        single = view * source_moments(atmosphere, nodes.altitude, max(first))
+        rest = view * source_moments(atmosphere, nodes.altitude, further, peak)
+        found, end = [], 0
+        for links, degree in zip(sets, first, strict=True):
+            r = links.rays
+            here = slice(end, end + r.mu.shape[1])
+            end = here.stop
+            ground = survives[:, end - r.mu_s_ground.shape[1] : end, -1]
+            of_first = _of_moments(links, single[:, here], degree)
+            of_further = _of_moments(links, rest[:, here], further)
+            found.append(cls(shell, links, atmosphere.ground_albedo, of_first, of_further, ground, (degree, further)))
+        return found
 
     def apply(self, first: State | None, further: State | None, degree: int) -> State:
         """The next order; its moments to ``degree``."""
@@ -233,6 +234,11 @@ class _Transport(eqx.Module):
         harmonics = _harmonics(degree, cosines(r.azimuths, radiance.dtype))
         by_order = jnp.sum(radiance[:, None] * harmonics.T[:, None, None, :, None], axis=4) / self.shell.dusk
         return State(_moments(r, by_order, degree), _irradiance(r, by_order[:, 0]))
+
+
+def _of_moments(links: Links, of_degrees: Float[Array, "i k n l w"], degree: int) -> Float[Array, "i k n c w"]:
+    """What moments to ``degree`` are multiplied by, from factors that depend on l only."""
+    return of_degrees[..., degrees(degree), :] * links.polar[..., : len(pairs(degree)), None]
 
 
 def source_moments(
@@ -261,7 +267,7 @@ def solve(atmosphere: Atmosphere, shell: Shell, *, order: int, degrees_: Degrees
     def seed(degree: int) -> State:
         return State(first.moments[:, : len(pairs(degree))], first.irradiance)
 
-    transport = _Transport.build(atmosphere, shell, shell.iterate, low, low)
+    transport, last = _Transport.build(atmosphere, shell, (low, degrees_.source), low)
     second = transport.apply(seed(low), None, low)
 
     def next_order(carry: tuple[State, State, State], _: None) -> tuple[tuple[State, State, State], None]:
@@ -274,7 +280,6 @@ def solve(atmosphere: Atmosphere, shell: Shell, *, order: int, degrees_: Degrees
     tail = _tail(term.moments[:, :1], previous.moments[:, :1])
     ground_tail = _tail(term.irradiance, previous.irradiance)
     total = _add(total, State(tail * term.moments, ground_tail * term.irradiance))
-    last = _Transport.build(atmosphere, shell, shell.last, degrees_.source, low)
     beyond = last.apply(seed(degrees_.source), total, degrees_.last)
     kept = beyond.moments.shape[1]
     return State(first.moments.at[:, :kept].add(beyond.moments), first.irradiance + beyond.irradiance)
