@@ -102,7 +102,13 @@ class Prediction:
         relative = self.standard_error[seen] / self.radiance[seen]
         known = np.isfinite(relative)
         error = f"median standard error {100 * np.median(relative[known]):.2g} %" if known.any() else "no error bars"
-        unknown = f", {100 * np.mean(~known):.0f} % of the numbers without an error bar" if 0 < known.mean() < 1 else ""
+        if not seen.any():
+            error = "all of it dark"
+        unknown = (
+            f", {100 * np.mean(~known):.0f} % of the numbers without an error bar"
+            if known.any() and not known.all()
+            else ""
+        )
         return f"Prediction: {width} x {height} pixels at {bands} nm, {error}{unknown}"
 
 

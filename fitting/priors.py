@@ -15,11 +15,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from diffatmo import constants, spectrum
-from diffatmo.atmosphere import Atmosphere
+from diffatmo.atmosphere import SPECTRAL, Atmosphere
 from diffatmo.numerics import array, safe_log
 from fitting._errors import FitError
 from fitting.parameters import Parameters
 from fitting.quantities import DERIVED, REFERENCE_NM, Quantity, numbers, quantities, spectral_name
+
+SMALLEST, LARGEST = 1e-15, 1e15
+"""Errors, and values, of which single precision holds the squares."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +30,8 @@ class Prior:
     """``name`` is ``value`` ± ``error``.
 
     ``name`` is a number of the result (``rayleigh_optical_depth_550``), or a spectral field, which means each of its
-    wavelengths on its own. With ``relative``, ``error`` is one of the logarithm: 0.1 for 10 %, ln 2 for a factor of two.
+    wavelengths on its own; where a tie makes them one number, it is known once, at the wavelength nearest to 550 nm. With
+    ``relative``, ``error`` is one of the logarithm: 0.1 for 10 %, ln 2 for a factor of two.
     """
 
     name: str
@@ -75,12 +79,16 @@ def collect(priors: Sequence[Prior], parameters: Parameters) -> Priors | None:
     index: list[int] = []
     stated: list[Prior] = []
     for prior in priors:
-        if not (prior.error > 0 and math.isfinite(prior.error) and math.isfinite(prior.value)):
-            raise FitError(f"prior: {prior}: expected a finite value and a finite error > 0")
+        if not (SMALLEST <= prior.error <= LARGEST and abs(prior.value) <= LARGEST):
+            raise FitError(
+                f"prior: {prior}: expected a finite value and a finite error > 0, the value up to {LARGEST:g}, the error from "
+                f"{SMALLEST:g} to {LARGEST:g}"
+            )
         if prior.relative and not prior.value > 0:
             raise FitError(f"prior: {prior}: a relative error needs a value > 0")
         meant = [number for number, known_one in enumerate(known) if prior.name == known_one.name]
-        meant = meant[:1] or [number for number, known_one in enumerate(known) if prior.name == known_one.field]
+        field = _once(prior.name, parameters) if any(prior.name == one.field for one in known) else prior.name
+        meant = meant[:1] or [number for number, one in enumerate(known) if field in (one.field, one.name)]
         if not meant:
             names = ", ".join(dict.fromkeys(one.field for one in known))
             raise FitError(f"prior: {prior.name!r} does not vary in this fit; numbers that do are of {names}")
@@ -99,27 +107,33 @@ def collect(priors: Sequence[Prior], parameters: Parameters) -> Priors | None:
 # Named priors -------------------------------------------------------------------------------------------------------
 
 
-def molecular(init: Atmosphere, *, pressure_hpa: float = 1013.25, temperature_k: float = 288.15) -> list[Prior]:
+def molecular(parameters: Parameters, *, pressure_hpa: float = 1013.25, temperature_k: float = 288.15) -> list[Prior]:
     """Air, from pressure and temperature at the ground.
 
     The optical depth of air is proportional to the mass above, thus to the pressure: Bodhaine et al. 1999, J. Atmos. Oceanic
     Technol. 16, 1854, whose values are good to 0.5 %. Column over density at the ground is R T / (M g) for any profile in
     hydrostatic equilibrium; that an exponential stands for the real profile makes it uncertain by 5 %.
+
+    Where a tie makes the scattering one number, so is what is known of it; by how much the tied spectrum departs from that of
+    air (λ⁻⁴ by 2 %) adds to its error.
     """
     for name, value in (("pressure_hpa", pressure_hpa), ("temperature_k", temperature_k)):
         if not (value > 0 and math.isfinite(value)):
             raise FitError(f"prior: molecular: {name}: got {value}, expected a number > 0")
     height = constants.GAS_CONSTANT * temperature_k / (constants.MOLAR_MASS_AIR * constants.GRAVITY) / 1000
     # The coefficients of the spectrum are those of sea level in the standard atmosphere.
-    standard = spectrum.rayleigh_scattering(init.wavelengths)
+    wavelengths = parameters.init.wavelengths
+    standard = spectrum.rayleigh_scattering(wavelengths)
     standard_height = constants.GAS_CONSTANT * 288.15 / (constants.MOLAR_MASS_AIR * constants.GRAVITY) / 1000
     depths = standard * standard_height * pressure_hpa / 1013.25
     source = "Bodhaine et al. 1999; hydrostatic equilibrium"
+    known, error = list(zip(map(float, wavelengths), map(float, depths), strict=True)), 0.005
+    if _together("rayleigh_optical_depth", parameters):
+        tied = parameters.atmosphere(parameters.start).rayleigh_scattering
+        error = math.hypot(error, float(np.std(np.log(np.asarray(tied) / np.asarray(standard)))))
+        known = [known[_middle(parameters)]]
     return [
-        *(
-            Prior(f"rayleigh_optical_depth_{float(nm):g}", float(depth), 0.005, True, source)
-            for nm, depth in zip(init.wavelengths, depths, strict=True)
-        ),
+        *(Prior(spectral_name("rayleigh_optical_depth", nm), depth, error, True, source) for nm, depth in known),
         Prior("rayleigh_scale_height", height, 0.05, True, source),
     ]
 
@@ -214,8 +228,15 @@ def _middle(parameters: Parameters) -> int:
 
 def _once(field: str, parameters: Parameters) -> str:
     """A spectral ``field``; or its number nearest to 550 nm where a tie makes it one, so that it counts once."""
-    if field in DERIVED:
-        tied = "mie_angstrom_exponent" in parameters.derived
-    else:
-        tied = any(block.fields == (field,) and block.start.size == 1 for block in parameters.blocks)
-    return spectral_name(field, float(parameters.init.wavelengths[_middle(parameters)])) if tied else field
+    if not _together(field, parameters):
+        return field
+    return spectral_name(field, float(parameters.init.wavelengths[_middle(parameters)]))
+
+
+def _together(field: str, parameters: Parameters) -> bool:
+    """Whether a tie makes the numbers of a spectral ``field`` one."""
+    if field == "mie_single_scattering_albedo":
+        return "mie_angstrom_exponent" in parameters.derived
+    own = "rayleigh_scattering" if field == "rayleigh_optical_depth" else field
+    spectral = own in SPECTRAL
+    return spectral and any(block.fields == (own,) and block.start.size == 1 for block in parameters.blocks)

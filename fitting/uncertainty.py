@@ -202,7 +202,7 @@ def _minima(solution: Solution) -> list[Minimum]:
 
 
 def fit(
-    observations: Sequence[Observation],
+    observations: Observation | Sequence[Observation],
     *,
     init: Atmosphere,
     free: Sequence[str],
@@ -221,7 +221,7 @@ def fit(
     """Recover an atmosphere's parameters from images of its sky, with error bars.
 
     Args:
-        observations: From :func:`fitting.observe`; all are explained by the one atmosphere.
+        observations: One or several, from :func:`fitting.observe`; all are explained by the one atmosphere.
         init: Where the search starts, and the value of everything that is not free.
         free: Names of the fields of :class:`~diffatmo.atmosphere.Atmosphere` to recover; a spectral field is free at
             every wavelength.
@@ -253,6 +253,7 @@ def fit(
             that is not finite at the start.
     """
     model = Moments() if model is None else model
+    observations = [observations] if isinstance(observations, Observation) else observations
     solution = solve(
         observations,
         init=init,

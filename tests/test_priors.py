@@ -8,12 +8,13 @@ import pytest
 import toy_sky
 from toy_sky import Toy
 
-from diffatmo import bands, earth
+from diffatmo import bands, earth, spectrum
 from fitting import FitError, Prior, fit, priors
 from fitting.nuisances import EACH
 from fitting.parameters import select
 from fitting.tables import doubts, notes
 
+AIR = select(earth(), ["rayleigh_scattering", "rayleigh_scale_height"])
 FEW = ["rayleigh_scattering", "mie_scattering", "mie_g", "mie_scale_height"]
 
 
@@ -74,12 +75,32 @@ def test_a_spectral_prior_is_one_for_each_wavelength():
 
 def test_molecular_prior_is_the_mass_of_the_air():
     """Optical depth at 550 nm of the standard atmosphere: 0.0973 (Bodhaine et al. 1999, table 5: 0.09717 at 45° N)."""
-    stated = {prior.name: prior for prior in priors.molecular(earth())}
+    stated = {prior.name: prior for prior in priors.molecular(AIR)}
     assert stated["rayleigh_optical_depth_550"].value == pytest.approx(0.0972, rel=0.005)
     assert stated["rayleigh_scale_height"].value == pytest.approx(8.43, abs=0.01)
-    high = {prior.name: prior for prior in priors.molecular(earth(), pressure_hpa=500.0)}
+    high = {prior.name: prior for prior in priors.molecular(AIR, pressure_hpa=500.0)}
     assert high["rayleigh_optical_depth_440"].value / stated["rayleigh_optical_depth_440"].value == pytest.approx(
         500 / 1013.25, rel=1e-6
+    )
+
+
+def test_tied_air_is_known_once():
+    """Three errors of 0.5 % of one number would make it known to 0.3 %; and λ⁻⁴ is not quite the spectrum of air."""
+    free = ["rayleigh_scattering", "rayleigh_scale_height"]
+    bodhaine = toy_sky.change(earth(), rayleigh_scattering=spectrum.rayleigh_scattering(earth().wavelengths))
+    known = lambda tie: priors.molecular(select(bodhaine, free, {"rayleigh_scattering": tie}))
+    exact, power = known("start"), known("lambda^-4")
+    assert [prior.name for prior in exact] == ["rayleigh_optical_depth_550", "rayleigh_scale_height"]
+    assert exact[0].error == pytest.approx(0.005, rel=1e-3)
+    # King's factor and the refractive index: 1.4 and -2.4 % at 680 and 440 nm where 550 nm agrees.
+    assert power[0].error == pytest.approx(np.hypot(0.005, np.std([0.014, 0, -0.024])), rel=0.05)
+
+
+def test_a_prior_on_a_tied_field_counts_once():
+    tied = select(earth(), ["mie_scattering"], {"mie_scattering": "grey"})
+    assert priors.collect([Prior("mie_scattering", 4e-3, 1e-5)], tied).value.shape == (1,)
+    assert priors.collect([Prior("mie_scattering", 4e-3, 1e-5)], select(earth(), ["mie_scattering"])).value.shape == (
+        3,
     )
 
 
@@ -122,6 +143,8 @@ def test_what_is_one_number_is_known_once():
     [
         (Prior("mie_g", 0.7, 0.0), "error > 0"),
         (Prior("mie_g", float("nan"), 0.1), "finite value"),
+        (Prior("mie_g", 1e39, 1.0), "value up to 1e\\+15"),
+        (Prior("mie_g", 0.7, 1e-45), "error from 1e-15"),
         (Prior("mie_g", -0.1, 0.1, relative=True), "relative error needs a value > 0"),
         (Prior("ozone_column", 300.0, 30.0), "does not vary in this fit"),
         (Prior("mie_gg", 0.7, 0.1), "'mie_gg' does not vary"),
@@ -134,7 +157,7 @@ def test_refuses(prior, message):
 
 def test_refuses_unphysical_weather():
     with pytest.raises(FitError, match="pressure_hpa"):
-        priors.molecular(earth(), pressure_hpa=-1.0)
+        priors.molecular(AIR, pressure_hpa=-1.0)
     with pytest.raises(FitError, match="latitude 100"):
         priors.ozone(latitude_deg=100, longitude_deg=0, day_of_year=1)
     with pytest.raises(FitError, match="continental average"):

@@ -195,7 +195,7 @@ def make_priors(table: Mapping[str, Any], parameters: "Parameters") -> "list[Pri
         error = said["relative_error" if relative else "error"]
         return [priors.Prior(said["name"], said["value"], error, relative, "the scene file")]
     if kind == "molecular":
-        stated = priors.molecular(parameters.init, **said)
+        stated = priors.molecular(parameters, **said)
     elif kind == "ozone":
         stated = priors.ozone(**(said | {"day_of_year": int(said["day_of_year"])}))
     else:
