@@ -159,10 +159,11 @@ def main() -> None:
     parser.add_argument("--largest", type=float, default=max(PIXELS), help="pixels of the largest picture")
     parser.add_argument("--only", choices=list(USUAL), help="one of the three series")
     parser.add_argument("--case", nargs=3, type=int, help=argparse.SUPPRESS)
-    parser.add_argument("--picture", nargs=2, type=float, help=argparse.SUPPRESS)
+    parser.add_argument("--pictures", nargs="+", type=float, help=argparse.SUPPRESS)
     asked = parser.parse_args()
-    if asked.picture:
-        print(picture(int(asked.picture[0]), asked.picture[1]))
+    if asked.pictures:
+        pixels, *suns = asked.pictures
+        print(*(picture(int(pixels), zenith) for zenith in suns))
         return
     if asked.case:
         print(json.dumps(measure(*asked.case)))
@@ -177,8 +178,7 @@ def main() -> None:
         )  # fmt: skip
         found[name] = []
         for case in cases:
-            for zenith in zeniths(case["images"]):
-                alone("--picture", str(case["pixels"]), repr(float(zenith)))
+            alone("--pictures", str(case["pixels"]), *(repr(float(zenith)) for zenith in zeniths(case["images"])))
             cost = json.loads(alone("--case", *(str(case[key]) for key in USUAL)))
             found[name].append((case[name], cost))
             print(name, case, {key: float(f"{value:.4g}") for key, value in cost.items()}, flush=True)
