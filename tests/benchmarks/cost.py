@@ -29,6 +29,8 @@ import diffatmo
 import fitting
 from diffatmo import sun
 from diffatmo.camera import Equirectangular
+from diffatmo.compiling import outermost
+from diffatmo.models import Moments
 from diffatmo.render import Scene, render
 
 NOISE, ALTITUDE_KM, STEPS = 0.01, 0.1, 3
@@ -62,7 +64,7 @@ def picture(pixels: int, zenith: float) -> Path:
     if not file.exists():
         file.parent.mkdir(exist_ok=True)
         scene = Scene(diffatmo.earth(), camera(pixels), ALTITUDE_KM, sun.direction(zenith=zenith, azimuth=0.5))
-        light = np.asarray(render(scene))
+        light = np.asarray(outermost(render)(scene, Moments()))
         light = light * (1 + NOISE * np.random.default_rng(pixels).standard_normal(light.shape, np.float32))
         with file.with_suffix(".part").open("wb") as part:
             np.save(part, light.astype(np.float32))
