@@ -32,6 +32,7 @@ from jaxtyping import Array, Float, Int
 from diffatmo.atmosphere import Atmosphere
 from diffatmo.models import Sky
 from fitting.batch import PIXEL_FIELDS, Views
+from fitting.correction import apply
 from fitting.nuisances import AEROSOL, SHADING
 from fitting.parameters import Coordinates
 from fitting.problem import Linear, Predicted, Problem, hazier, seen
@@ -80,7 +81,8 @@ def linearise(x: Coordinates, linear: Linear, problem: Problem) -> Linearisation
 
 def spread(problem: Problem, everywhere: T, apart: T) -> Any:
     """``apart`` for every array of ``problem`` that has pixels, ``everywhere`` for any other."""
-    where = lambda p: [p.weight, p.correction, *(getattr(p.batch, name) for name in PIXEL_FIELDS)]
+    of_correction = lambda p: [] if p.correction is None else [p.correction.ratio, p.correction.slope]
+    where = lambda p: [p.weight, *of_correction(p), *(getattr(p.batch, name) for name in PIXEL_FIELDS)]
     marks = jax.tree.map(lambda _: everywhere, problem)
     return eqx.tree_at(
         where, marks, replace_fn=lambda leaf: leaf if leaf is None else apart, is_leaf=lambda x: x is None
@@ -168,7 +170,7 @@ def visit(
     """
     batch = problem.batch
     coordinates, moved = problem.parts(x)
-    colour, _ = problem.colours()
+    colour, channel = problem.colours()
     seeds = jnp.asarray(colour == np.arange(colour.max() + 1)[:, None], dtype=coordinates.dtype)
     air, of_air = _push(problem.parameters.atmosphere, (coordinates,), (seeds,))
     # What moves the view comes first among the offsets, shading next, and last a free aerosol.
@@ -182,8 +184,9 @@ def visit(
     pixels |= {"weight": tiled(problem.weight), "directions": tiled(views.directions)}
     if shaded := batch.shading.shape[-1]:
         pixels["modulation"] = tiled(batch.modulation(moved))
-    if problem.correction is not None:
-        pixels["correction"] = tiled(problem.correction)
+    if (correction := problem.correction) is not None:
+        pixels |= {"correction": tiled(correction.ratio), "slope": tiled(correction.slope)}
+        away = correction.away(coordinates, colour, channel, batch.measured.shape[-1])
     if of_views is not None:
         # Images first, tiles next, then the components.
         pixels["turned"] = jnp.moveaxis(jax.vmap(tiled)(of_views.directions), 0, 2)
@@ -215,8 +218,10 @@ def visit(
                 before, after = jnp.split(tangents, [tangents.shape[-1] - apart], axis=-1)
                 tangents = jnp.concatenate([before, light[..., None] * tile["shading"], after], axis=-1)
                 light, tangents = light * tile["modulation"], tangents * tile["modulation"][..., None]
-            if "correction" in tile:
-                light, tangents = light * tile["correction"], tangents * tile["correction"][..., None]
+            if correction is not None:
+                light, tangents, tile["correction"] = apply(
+                    light, tangents, tile["correction"], tile["slope"], away, correction.colour
+                )
             return add(carry, tile | own | {"radiance": light, "tangents": tangents})
 
         return jax.lax.scan(of_tile, empty, pixels)

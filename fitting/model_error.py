@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from diffatmo.models import Model
 from fitting.elimination import RANK_TOLERANCE
-from fitting.least_squares import pushes
+from fitting.least_squares import Factor, pushes
 from fitting.linearisation import AXIS, spread
 from fitting.parameters import Coordinates
 from fitting.problem import Predicted, Problem, predict
@@ -27,14 +27,14 @@ where it is 0.1 %; more with g above 0.8, where neither resolves the outskirts o
 understated (``tests/benchmarks/accuracy.py``, ``recovery.py``)."""
 
 
-def correction(x: Coordinates, problem: Problem, radiance: Predicted, finer: Model) -> Predicted:
+def ratio(x: Coordinates, problem: Problem, radiance: Predicted, finer: Model) -> Predicted:
     """What ``finer`` expects over the ``radiance`` of the problem's own model; 1 where there is nothing to compare."""
     if problem.batch.mesh is None:
-        return _correction(x, problem, radiance, finer)
+        return _ratio(x, problem, radiance, finer)
     everywhere, apart = PartitionSpec(), PartitionSpec(None, AXIS)
     arrays, rest = eqx.partition(problem, eqx.is_array)
     return jax.shard_map(
-        lambda x, arrays, radiance: _correction(x, eqx.combine(arrays, rest), radiance, finer),
+        lambda x, arrays, radiance: _ratio(x, eqx.combine(arrays, rest), radiance, finer),
         mesh=problem.batch.mesh,
         in_specs=(everywhere, spread(arrays, everywhere, apart), apart),
         out_specs=apart,
@@ -42,38 +42,44 @@ def correction(x: Coordinates, problem: Problem, radiance: Predicted, finer: Mod
     )(x, arrays, radiance)
 
 
-def _correction(x: Coordinates, problem: Problem, radiance: Predicted, finer: Model) -> Predicted:
+def _ratio(x: Coordinates, problem: Problem, radiance: Predicted, finer: Model) -> Predicted:
     coordinates, moved = problem.parts(x)
     batch = problem.batch
     wanted = predict(finer.sky, problem.parameters.atmosphere(coordinates), batch.views(moved), batch.tiles)
     if batch.shading.shape[-1]:
         wanted = wanted * batch.modulation(moved)
     known = batch.used[..., None] & (radiance > 0) & (wanted > 0)
-    ratio = wanted / jnp.where(known, radiance, 1)
-    return jnp.where(known, jnp.clip(ratio, 1 / LARGEST_CORRECTION, LARGEST_CORRECTION), 1)
+    found = wanted / jnp.where(known, radiance, 1)
+    return jnp.where(known, jnp.clip(found, 1 / LARGEST_CORRECTION, LARGEST_CORRECTION), 1)
 
 
 def deviation(problem: Problem) -> Float[np.ndarray, "image w"]:
     """RMS of the correction over the used pixels of every image."""
+    assert problem.correction is not None
     used = np.asarray(problem.batch.used)
-    off = np.where(used[..., None], np.asarray(problem.correction) - 1, 0)
+    off = np.where(used[..., None], np.asarray(problem.correction.ratio) - 1, 0)
     return np.sqrt((off**2).sum(axis=1) / np.maximum(used.sum(axis=1), 1)[:, None])
 
 
 def moved(before: Point, best: Point, error: Float[np.ndarray, "n n"], size: int) -> float:
     """The largest way of the first ``size`` coordinates from ``before`` to ``best``, in standard errors, ``error`` included."""
-    inverse = _inverse(best)
+    inverse = _inverse(best.triangle)
     bars = np.sqrt(np.diag(inverse @ inverse.T + error))[:size]
     way = np.abs(np.asarray(best.y, dtype=np.float64) - np.asarray(before.y, dtype=np.float64))[:size]
     return float(np.max(way / np.where(bars > 0, bars, np.inf), initial=0.0))
 
 
-def _inverse(best: Point) -> Float[np.ndarray, "n k"]:
+def _inverse(triangle: Factor) -> Float[np.ndarray, "n k"]:
     """R⁻¹: the pseudo-inverse, as some combinations may not be determined at all."""
-    length = np.linalg.norm(best.triangle[:, :-1], axis=0)
+    length = np.linalg.norm(triangle[:, :-1], axis=0)
     scale = np.where(length > 0, length, 1)
-    inverse: Float[np.ndarray, "n k"] = np.linalg.pinv(best.triangle[:, :-1] / scale, rcond=RANK_TOLERANCE)
+    inverse: Float[np.ndarray, "n k"] = np.linalg.pinv(triangle[:, :-1] / scale, rcond=RANK_TOLERANCE)
     return inverse / scale[:, None]
+
+
+def standard_errors(triangle: Factor) -> Float[np.ndarray, " n"]:
+    """Those of the coordinates by the noise alone, as far as they are determined."""
+    return np.linalg.norm(_inverse(triangle), axis=1)
 
 
 def covariance(best: Point, problem: Problem) -> Float[np.ndarray, "n n"]:
@@ -88,6 +94,6 @@ def covariance(best: Point, problem: Problem) -> Float[np.ndarray, "n n"]:
     pushed = pushed * (REMAINING / math.sqrt(2 * pushed.shape[2]))
     every = np.concatenate([pushed.reshape(-1, best.y.size), pushed.sum(axis=1).reshape(-1, best.y.size)])
     # δy = (RᵀR)⁻¹ Jᵀ δr.
-    inverse = _inverse(best)
+    inverse = _inverse(best.triangle)
     shifts = every @ inverse @ inverse.T
     return shifts.T @ shifts

@@ -19,6 +19,7 @@ from diffatmo.atmosphere import Atmosphere
 from diffatmo.models import Model, Moments, Sky
 from diffatmo.models.base import View
 from fitting.batch import Batch, Views
+from fitting.correction import Correction
 from fitting.observation import sigma
 from fitting.parameters import Coordinates, Parameters
 from fitting.priors import Priors
@@ -33,9 +34,9 @@ class Problem(eqx.Module):
     """All that the residuals depend on besides ``y``.
 
     ``weight`` is 1/sigma, and 0 for pixels that are not used; ``shell`` is what the model knows of the planet alone, if
-    it makes use of that and the planet is not free. ``correction`` is what a finer model says, over what this one says, at
-    one point near the optimum; it scales the radiance and its derivatives. ``loss`` is what outliers are given, if they are
-    not given their squares, and ``fields`` are the forms that errors of the model may have.
+    it makes use of that and the planet is not free. ``correction`` is what a finer model says over what this one says.
+    ``loss`` is what outliers are given, if they are not given their squares, and ``fields`` are the forms that errors of the
+    model may have.
     """
 
     model: Model
@@ -43,7 +44,7 @@ class Problem(eqx.Module):
     batch: Batch
     weight: Predicted
     shell: Any = None
-    correction: Predicted | None = None
+    correction: Correction | None = None
     priors: Priors | None = None
     loss: Loss | None = None
     fields: Fields | None = None

@@ -3,8 +3,8 @@
 The search itself is :mod:`fitting.search`'s.
 
 *Resolution.* The steps are those of the model as it is given. A model that knows a ``finer`` one of itself is then compared
-with it at the optimum, and the last pass explains the images by the finer model there, with the slopes of the first. Where that
-moves the optimum, the comparison is made again.
+with it at the optimum, and the last pass explains the images by the finer model there, with the slopes of the first and, where
+it matters, how the comparison changes (:mod:`fitting.correction`). Where that moves the optimum, the comparison is made again.
 
 *Starts.* A search that has gone astray, which its χ² shows, is begun anew from the best atmospheres of a coarse grid
 (:mod:`fitting.starts`).
@@ -38,6 +38,7 @@ from fitting import model_error
 from fitting._errors import FitError
 from fitting.batch import Batch, stack
 from fitting.checkpoint import Checkpoint, digest, load, save
+from fitting.correction import Correction
 from fitting.devices import mesh_of
 from fitting.elimination import starting
 from fitting.evaluation import check_finite, corrected, evaluated, pose, rescaled, weighed
@@ -76,6 +77,9 @@ again: in dense haze the model alone leads 75 of them astray, and its correction
 GROWTH = 10.0
 """Relative growth of the correction along the way from the model's optimum to the finer one's, over the correction: 6 and more
 in dense haze."""
+
+FAR = 2.0
+"""Distance, in standard errors, beyond which the slopes of a correction are made anew."""
 
 HOPELESS_MISFIT = 1e4
 """Reduced χ² of images that have nothing to do with the model: another unit, another exposure."""
@@ -333,15 +337,22 @@ def _noisier(a: Problem, b: Problem) -> float:
 def _refined(run: _Run, found: _Found, finer: Model) -> tuple[_Found, Float[np.ndarray, "n n"]]:
     """The optimum if the images are explained by ``finer`` there, and the covariance of what that may leave of errors."""
     best, problem, alone = found.best, found.problem, found.problem
-    here, light, on = best.y, best.linearisation.radiance, best.onward
+    here, linearisation, on = best.y, best.linearisation, best.onward
+    slopes: tuple[Correction, np.ndarray] | None = None
+    metric = best.triangle[:, :-1]
     places: list[np.ndarray] = []
     images: list[np.ndarray] = []
     try:
         way = math.inf
         for _ in range(CORRECTIONS):
-            problem = corrected(here, light, alone, finer)
+            place = np.asarray(here, dtype=np.float64)
+            if slopes is not None and np.linalg.norm(metric @ (place - slopes[1])) > FAR:
+                slopes = None
+            problem = corrected(here, linearisation, alone, finer, slopes[0] if slopes else None)
+            assert problem.correction is not None
+            slopes = slopes or (problem.correction, place)
             best = run.search(on, problem, run.tolerance)
-            places.append(np.asarray(here, dtype=np.float64))
+            places.append(place)
             images.append(np.asarray(best.y, dtype=np.float64))
             metric = best.triangle[:, :-1]
             moves = [np.linalg.norm(metric @ (led - place)) for place, led in zip(places, images, strict=True)]
@@ -357,7 +368,7 @@ def _refined(run: _Run, found: _Found, finer: Model) -> tuple[_Found, Float[np.n
             here = array(mixed(places, images, metric), best.y.dtype)
             x, linear = problem.split(here)
             here = jnp.concatenate([jnp.clip(x, *problem.limits), linear])
-            light = run.evaluate(*problem.split(here), alone).radiance
+            linearisation = run.evaluate(*problem.split(here), alone)
             on = here
         else:
             best = best._replace(converged=False, message=RESTLESS.format(way))
@@ -513,5 +524,5 @@ def _compile_ahead(problem: Problem, finer: Model | None) -> list[Thread]:
         compile_ahead(linearise, problem.start, linear, problem),
     ]
     if finer is not None:
-        compiling.append(compile_ahead(model_error.correction, problem.start, problem, batch.measured, finer))
+        compiling.append(compile_ahead(model_error.ratio, problem.start, problem, batch.measured, finer))
     return compiling

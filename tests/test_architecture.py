@@ -50,7 +50,7 @@ LEVELS = [
     ["fitting.parameters", "fitting.observation"],
     ["fitting.priors", "fitting.robust", "fitting.checkpoint", "fitting.nuisances"],
     ["fitting.batch"],
-    ["fitting.smooth"],
+    ["fitting.smooth", "fitting.correction"],
     ["fitting.problem"],
     ["fitting.linearisation"],
     ["fitting.least_squares", "fitting.devices"],

@@ -13,11 +13,12 @@ from plain_residuals import residuals
 
 from diffatmo.models import RayMarch
 from fitting.batch import rounded, stack
+from fitting.correction import SLOPES, Correction
 from fitting.least_squares import jacobian, pushes, triangle
 from fitting.linearisation import linearise
 from fitting.observation import sigma
 from fitting.parameters import select
-from fitting.problem import Problem, light, predict
+from fitting.problem import Problem, light, predict, whitened
 from fitting.smooth import Fields
 
 NM = [680.0, 550.0, 440.0]
@@ -147,12 +148,41 @@ def test_smooth_fields_are_orthogonal_with_mean_square_one():
     assert fields.coefficient.shape[-1] == 16
 
 
+def test_a_correction_that_changes_has_its_part_of_the_derivatives(x64):
+    """Along a number of its own for each channel, and along one for all; the third place is free."""
+    ours, y = problem(toy_sky.Toy(), toy_sky.FREE, tie=TIE)
+    colour, channel = ours.colours()
+    (spectral, *_), (shared, *_) = colour[channel >= 0], colour[channel < 0]
+    random = np.random.default_rng(5)
+    ratio = jnp.asarray(random.uniform(0.9, 1.1, ours.weight.shape))
+    slope = jnp.asarray(random.uniform(-0.5, 0.5, (*ours.weight.shape, SLOPES)))
+    at = y[: ours.parameters.size] - 0.1
+    ours = dataclasses.replace(ours, correction=Correction(ratio, at, slope, jnp.array([spectral, shared, -1])))
+
+    def corrected(y):
+        radiance = predict(ours.sky, ours.parameters.atmosphere(ours.parts(y)[0]), ours.batch.views(ours.parts(y)[1]))
+        for number, (tangent, own) in enumerate(zip(colour, channel, strict=True)):
+            for place in np.flatnonzero(np.array([spectral, shared]) == tangent):
+                seen = (np.arange(3) == own) | (own < 0)
+                radiance = radiance * jnp.exp(seen * slope[..., place] * (y[number] - at[number]))
+        return whitened(y, radiance * ratio, ours).reshape(-1)
+
+    plain = eqx.filter_jit(jax.jacfwd(corrected))(y)
+    np.testing.assert_allclose(plain_residuals.jacobian(y, ours), plain, atol=1e-10 * np.abs(plain).max())
+    found = linearise(*ours.split(y), ours)
+    assert np.sum(np.asarray(found.rows)[..., -1] ** 2) == pytest.approx(float(corrected(y) @ corrected(y)), rel=1e-10)
+
+
 @pytest.mark.parametrize("corrected", [False, True])
 def test_a_push_is_the_jacobian_transposed(x64, corrected):
     """Against an error put into the radiance by hand: relative, or as large as what a correction has added there."""
     ours, y = problem(toy_sky.Toy(), toy_sky.FREE, exposure=("free", "fixed"))
     correction = jnp.asarray(np.random.default_rng(3).uniform(0.9, 1.1, ours.weight.shape))
-    ours = dataclasses.replace(ours, fields=Fields.of(ours.batch, 1), correction=correction if corrected else None)
+    ours = dataclasses.replace(
+        ours,
+        fields=Fields.of(ours.batch, 1),
+        correction=Correction.constant(correction, y[: ours.parameters.size]) if corrected else None,
+    )
     got = pushes(y, linearise(*ours.split(y), ours), ours)
     coordinates, moved = ours.parts(ours.split(y)[0])
     atmosphere = ours.parameters.atmosphere(coordinates)
