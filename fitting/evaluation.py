@@ -36,10 +36,20 @@ LONGEST = 0.3
 """Of the steps along which it is measured, which else are error bars."""
 
 
-def pose(batch: Batch, parameters: Parameters, priors: Sequence[Prior], loss: str | None, model: Model) -> Problem:
-    """The problem with weights from the measured signal; what is known of the planet is no more than its form yet."""
+def pose(
+    batch: Batch,
+    parameters: Parameters,
+    priors: Sequence[Prior],
+    loss: str | None,
+    model: Model,
+    finer: Model | None = None,
+) -> Problem:
+    """The problem with weights from the measured signal; what is known of the planet is no more than its form yet.
+
+    With a ``finer`` model it has room for a correction, which is none yet.
+    """
     signal, shell = batch.measured, eqx.filter_eval_shape(planet_shell, model, parameters)
-    none = Correction.constant(jnp.ones_like(signal), parameters.start)
+    none = None if finer is None else Correction.constant(jnp.ones_like(signal), parameters.start)
     robust = None if loss is None else Loss(loss, jnp.ones((), signal.dtype))
     fields = Fields.of(batch, FIELD_DEGREE)
     weight = outermost(weights)(batch, array(measured_light(batch), signal.dtype))
@@ -148,12 +158,13 @@ def restored(
 ) -> tuple[Problem, Linearisation]:
     """The problem of which ``y`` is the solution, with noise, correction and scale of the loss as they are there."""
     batch = stack(observations, [float(nm) for nm in parameters.init.wavelengths])
-    problem = pose(batch, parameters, priors, loss, model)
+    finer = model.finer() if refine else None
+    problem = pose(batch, parameters, priors, loss, model, finer)
     problem = replace(problem, shell=outermost(planet_shell)(model, parameters))
     x, linear = problem.split(y)
     found = evaluated(x, linear, problem)
     radiance = found.radiance
-    if refine and (finer := model.finer()) is not None:
+    if finer is not None:
         problem = corrected(y, found, problem, finer)
         assert problem.correction is not None
         radiance = radiance * problem.correction.ratio

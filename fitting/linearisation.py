@@ -81,7 +81,7 @@ def linearise(x: Coordinates, linear: Linear, problem: Problem) -> Linearisation
 
 def spread(problem: Problem, everywhere: T, apart: T) -> Any:
     """``apart`` for every array of ``problem`` that has pixels, ``everywhere`` for any other."""
-    of_correction = lambda p: [] if p.correction is None else [p.correction.ratio, p.correction.slope]
+    of_correction = lambda p: [] if problem.correction is None else [p.correction.ratio, p.correction.slope]
     where = lambda p: [p.weight, *of_correction(p), *(getattr(p.batch, name) for name in PIXEL_FIELDS)]
     marks = jax.tree.map(lambda _: everywhere, problem)
     return eqx.tree_at(

@@ -273,7 +273,7 @@ def of_shots(
         images = [replace(frame, name=f"{frame.name} {number}") for number, frame in enumerate(frames.values())]
         problem = pose(stack(images, wavelengths), parameters, (), None, model)
         # Each photo will have weights of its own.
-        problem = replace(problem, shell=outermost(planet_shell)(model, parameters), correction=None, fields=None)
+        problem = replace(problem, shell=outermost(planet_shell)(model, parameters), fields=None)
         found = jax.tree.map(np.asarray, outermost(derivatives)(problem.start, problem))
         lost = [~np.isfinite(values).reshape(*values.shape[:2], -1).all(axis=-1) for values in found]
         used = np.asarray(problem.batch.used)

@@ -456,7 +456,8 @@ def solve(
     size = parameters.size + batch.nuisances.size
     if count(batch) < size:
         raise FitError(f"{count(batch)} pixels and channels cannot determine {size} parameters; mask less or free less")
-    problem, finer = pose(batch, parameters, priors, loss, model), model.finer() if refine else None
+    finer = model.finer() if refine else None
+    problem = pose(batch, parameters, priors, loss, model, finer)
     _check_weights(batch, problem.weight, names)
     compiling = _compile_ahead(problem, finer)
     for thread in compiling[:2]:
