@@ -28,7 +28,7 @@ def main() -> None:
         tie={"mie_absorption": "start"},
         priors=[fitting.Prior("rayleigh_scale_height", 8.0, 0.3)],
         loss="huber",
-        model=toy_sky.Toy(),
+        model=toy_sky.Hasty(),
     )
     assert result.converged, result.message
     numbers = {

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import toy_sky
-from toy_sky import FREE, Toy
+from toy_sky import FREE, Hasty, Toy
 
 from diffatmo.models.base import Ray
 from fitting import FitError, evaluation, fit, model_error, profile, tables
@@ -286,23 +286,6 @@ def test_model_error_covers_a_fifth_of_the_correction():
     assert blind.moved == 0
     assert any("finer self has moved" in doubt for doubt in tables.doubts(dataclasses.replace(found, moved=7.2)))
     assert not any("finer self" in doubt for doubt in tables.doubts(dataclasses.replace(found, moved=5.0)))
-
-
-class Hasty(Toy):
-    """The toy sky with an error that grows with the aerosol, and the toy sky itself as the finer model."""
-
-    def finer(self):
-        return Toy()
-
-    def sky(self, atmosphere):
-        return HastySky(atmosphere)
-
-
-class HastySky(toy_sky.ToySky):
-    def radiance(self, *, altitude, view, sun):
-        exact = super().radiance(altitude=altitude, view=view, sun=sun)
-        wrong = 1 - 15 * self.atmosphere.mie_scattering * jnp.exp(4 * (view @ sun - 1))[..., None]
-        return Ray(exact.radiance * wrong, exact.transmittance)
 
 
 def test_error_bars_are_those_of_the_finer_model(monkeypatch):

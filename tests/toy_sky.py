@@ -58,6 +58,23 @@ CAMERA = Equirectangular(16, 64, upper=True)
 DIRECTIONS = np.asarray(CAMERA.directions())
 
 
+class Hasty(Toy):
+    """The toy sky with an error that grows with the aerosol, and the toy sky itself as the finer model."""
+
+    def finer(self):
+        return Toy()
+
+    def sky(self, atmosphere):
+        return HastySky(atmosphere)
+
+
+class HastySky(ToySky):
+    def radiance(self, *, altitude, view, sun):
+        exact = super().radiance(altitude=altitude, view=view, sun=sun)
+        wrong = 1 - 15 * self.atmosphere.mie_scattering * jnp.exp(4 * (view @ sun - 1))[..., None]
+        return Ray(exact.radiance * wrong, exact.transmittance)
+
+
 def truth() -> Atmosphere:
     return Atmosphere(
         wavelengths=[680.0, 550.0, 440.0],
