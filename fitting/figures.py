@@ -336,5 +336,6 @@ def histogram_figure(result: Findings) -> Figure:
     axes.set_yscale("log")
     axes.set_ylim(1e-5, 2 * highest)
     axes.set_xlabel("(measured - fitted) / sigma")
+    axes.set_ylabel("share of the pixels per sigma")
     axes.legend(fontsize=8, frameon=False)
     return figure

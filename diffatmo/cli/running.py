@@ -79,12 +79,12 @@ def run(job: Job, directory: Path, *, overwrite: bool, quiet: bool = False, writ
             starts=job.starts,
             checkpoint=file,
         )
+        interrupted = result.message == search.INTERRUPTED
         if job.profile and result.converged:
             console.print("Profiles:")
             result = fitting.profile(result, *job.profile, progress=show_point)
-        elif job.profile:
+        elif job.profile and not interrupted:
             console.print("No profiles: they are about an optimum, and none was found.")
-        interrupted = result.message == search.INTERRUPTED
         status = INTERRUPTED if interrupted else 0 if result.converged else NOT_CONVERGED
         if not write:
             return status
