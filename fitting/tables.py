@@ -5,6 +5,7 @@ import html
 import io
 import math
 from collections.abc import Sequence
+from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -106,15 +107,21 @@ def _row(estimate: Estimate, *, first: bool) -> _Row:
 
 
 def _rows(result: Findings) -> list[tuple[_Row, Estimate, bool]]:
-    """All rows of the table, with what they show, and whether a rule goes above (a new kind of number begins)."""
+    """All rows of the table, with what they show, and whether a rule goes above (a new kind of number begins).
+
+    A field that is the same at all wavelengths, as one that a tie makes one number, has one row.
+    """
     groups = [[e for e in result.parameters if e.derived == derived] for derived in (False, True)] + [result.nuisances]
-    rows = []
+    rows: list[tuple[_Row, Estimate, bool]] = []
     for number, group in enumerate(groups):
-        before = None
-        for estimate in group:
-            rule = before is None and number > 0
-            rows.append((_row(estimate, first=estimate.field != before), estimate, rule))
-            before = estimate.field
+        began = len(rows)
+        for _, of_field in groupby(group, key=lambda estimate: estimate.field):
+            estimates = list(of_field)
+            own = [_row(estimate, first=place == 0) for place, estimate in enumerate(estimates)]
+            if len(own) > 1 and len({row._replace(parameter="", unit="", nm="") for row in own}) == 1:
+                own = [own[0]._replace(nm="all")]
+            for row, estimate in zip(own, estimates, strict=False):
+                rows.append((row, estimate, len(rows) == began and number > 0))
     return rows
 
 

@@ -12,9 +12,9 @@ import toy_sky
 from rich.console import Console
 
 from diffatmo import atmosphere, color, imageio, scene, skymask
-from fitting import Estimate, FitError, Prior, report
+from fitting import Estimate, FitError, Prior, fit, report
 from fitting.figures import as_png, mask_figure, shares
-from fitting.tables import format_number, fragment
+from fitting.tables import format_number, fragment, to_rows
 from fitting.tables import text as plain
 
 
@@ -319,3 +319,17 @@ def test_table_fits_into_eighty_columns():
 )
 def test_numbers_show_the_digits_that_mean_something(value, error, text):
     assert format_number(value, error) == text
+
+
+def test_a_field_that_a_tie_makes_one_number_has_one_row():
+    tie = {"mie_scattering": "grey"}
+    tied = fit(
+        toy_sky.observations(), init=toy_sky.truth(), free=["mie_scattering", "mie_g"], tie=tie, model=toy_sky.Toy()
+    )
+    rows = [line.split() for line in plain(tied).splitlines()]
+    of_scattering = [words for words in rows if words[:1] == ["mie_scattering"]]
+    assert len(of_scattering) == 1
+    assert of_scattering[0][1] == "all"
+    assert not any(words[:1] == [nm] for words in rows for nm in ("680", "550", "440"))
+    # What is read by machines has all.
+    assert [row["wavelength_nm"] for row in to_rows(tied) if row["field"] == "mie_scattering"] == [680, 550, 440]
