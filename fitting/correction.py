@@ -1,65 +1,55 @@
 """What a finer model says over what the fitted one says, and how that changes with what is fitted.
 
-The ratio of the two is known at one place. Elsewhere it is taken to be exponential in the coordinates along which it changes:
+The ratio of the two is known at one place. Along the few directions in which the images leave most room, it is known a step of
+one standard error away as well, and taken to be exponential in between:
 
-    ratio(x) = ratio(x₀) exp(Σₖ slopeₖ (xₖ - x₀ₖ)),
+    ratio(x) = ratio(x₀) exp(Σₖ slopeₖ zₖ),    z = P (x - x₀),
 
-so that the derivatives of the light are the finer model's along those. They matter along a valley, as that of the two scale
-heights in one picture of a hazy sky: what a coordinate does there is all but undone by others, and of so small a rest the
-coarser model may have half or double, and with it its error bars.
+where zₖ are standard errors along direction k, and no other direction changes z. So the derivatives of the light are those of
+the finer model where it matters: along a valley, as that of the two scale heights in one picture of a hazy sky, what a
+coordinate does is all but undone by others, and of so small a rest the coarser model may have half or double, and with it its
+error bars.
 """
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
-SLOPES = 3
-"""Tangents along which the ratio may change: as many as there are places for, since other shapes would be compiled anew."""
+DIRECTIONS = 3
+"""Along which the ratio may change: as many as there are places for, since other shapes would be compiled anew."""
 
 Ratio = Float[Array, "image pixel w"]
-Tangents = Float[Array, "pixel w colour"]
 
 
 class Correction(eqx.Module):
-    """The ratio at ``at``, and the derivatives of its logarithm along the tangents numbered ``colour``; -1 is none."""
+    """The ratio at ``at``, and the derivatives of its logarithm along each direction, in which ``along`` counts the steps."""
 
     ratio: Ratio
-    at: Float[Array, " n"]
-    slope: Float[Array, "image pixel w s"]
-    colour: Int[Array, " s"]
+    at: Float[Array, " x"]
+    slope: Float[Array, "image pixel w k"]
+    along: Float[Array, "k x"]
+    """P. All zero for a direction that is not there."""
 
     @classmethod
-    def constant(cls, ratio: Ratio, at: Float[Array, " n"]) -> "Correction":
+    def constant(cls, ratio: Ratio, at: Float[Array, " x"]) -> "Correction":
         """The same ratio everywhere."""
-        none = jnp.zeros((*ratio.shape, SLOPES), ratio.dtype)
-        return cls(ratio, at, none, jnp.full(SLOPES, -1))
+        none = jnp.zeros((*ratio.shape, DIRECTIONS), ratio.dtype)
+        return cls(ratio, at, none, jnp.zeros((DIRECTIONS, at.size), at.dtype))
 
-    def away(
-        self,
-        coordinates: Float[Array, " n"],
-        colour: Int[np.ndarray, " n"],
-        channel: Int[np.ndarray, " n"],
-        channels: int,
-    ) -> Float[Array, "w s"]:
-        """How far ``coordinates`` are, along each tangent in each channel: ``colour`` is the tangent of each coordinate, and
-        ``channel`` the one in which it is seen, -1 for all."""
-        seen = (channel[:, None] == np.arange(channels)) | (channel[:, None] < 0)
-        shared = colour[:, None] == self.colour
-        far = (coordinates - self.at)[:, None, None]
-        return jnp.sum(jnp.where(seen[:, :, None] & shared[:, None], far, 0), axis=0)
+    def steps(self, x: Float[Array, " x"]) -> Float[Array, " k"]:
+        """How far ``x`` is along each direction."""
+        return jnp.sum(self.along * (x - self.at), axis=-1)
 
 
 def apply(
     light: Float[Array, "pixel w"],
-    tangents: Tangents,
+    tangents: Float[Array, "pixel w t"],
     ratio: Float[Array, "pixel w"],
-    slope: Float[Array, "pixel w s"],
-    away: Float[Array, "w s"],
-    colour: Int[Array, " s"],
-) -> tuple[Float[Array, "pixel w"], Tangents, Float[Array, "pixel w"]]:
-    """The finer model's light and derivatives from the coarser one's, and the ratio of the lights."""
-    ratio = ratio * jnp.exp(jnp.sum(slope * away, axis=-1))
-    grown = jnp.matmul(slope, jax.nn.one_hot(colour, tangents.shape[-1], dtype=slope.dtype), precision="highest")
-    return light * ratio, (tangents + light[..., None] * grown) * ratio[..., None], ratio
+    slope: Float[Array, "pixel w k"],
+    steps: Float[Array, " k"],
+) -> tuple[Float[Array, "pixel w"], Float[Array, "pixel w t+k"], Float[Array, "pixel w"]]:
+    """The finer model's light from the coarser one's, its derivatives along the tangents and, by the change of the ratio alone,
+    along the directions, and the ratio."""
+    ratio = ratio * jnp.exp(jnp.sum(slope * steps, axis=-1))
+    light = light * ratio
+    return light, jnp.concatenate([tangents * ratio[..., None], light[..., None] * slope], axis=-1), ratio

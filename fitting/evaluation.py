@@ -1,6 +1,6 @@
 """A problem, posed and evaluated where it is computed, and its changes on the way to the solution."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import equinox as eqx
@@ -15,8 +15,9 @@ from diffatmo.numerics import array
 from fitting import model_error
 from fitting._errors import FitError
 from fitting.batch import Batch, stack
-from fitting.correction import SLOPES, Correction
+from fitting.correction import DIRECTIONS, Correction
 from fitting.devices import collected, gathered, placed
+from fitting.elimination import RANK_TOLERANCE
 from fitting.least_squares import reduce
 from fitting.linearisation import Linearisation, linearise
 from fitting.observation import Observation, light_of
@@ -30,10 +31,19 @@ FIELD_DEGREE = 3
 """Degree in direction up to which the model's errors are correlated."""
 
 CHANGE = 3.0
-"""Relative change of a correction over the change of the coordinate that causes it, in about: 1 to 5 in dense haze."""
+"""Relative change of a correction over the change of the coordinates that causes it, in about: 1 to 5 in dense haze."""
+
+NEGLIGIBLE = 0.5
+"""Change of the light that is none, in units of the noise, in which a step of one standard error changes it by 1."""
+
+SLIGHT = 0.05
+"""Change of the light by a correction's, over that by the step, that is left out: so much it may do to an error bar."""
+
+TRIED = 6
+"""Directions that are looked at."""
 
 LONGEST = 0.3
-"""Of the steps along which it is measured, which else are error bars."""
+"""Of the steps along which the change is measured, which else are standard errors."""
 
 
 def pose(
@@ -49,11 +59,14 @@ def pose(
     With a ``finer`` model it has room for a correction, which is none yet.
     """
     signal, shell = batch.measured, eqx.filter_eval_shape(planet_shell, model, parameters)
-    none = None if finer is None else Correction.constant(jnp.ones_like(signal), parameters.start)
     robust = None if loss is None else Loss(loss, jnp.ones((), signal.dtype))
     fields = Fields.of(batch, FIELD_DEGREE)
     weight = outermost(weights)(batch, array(measured_light(batch), signal.dtype))
-    return Problem(model, parameters, batch, weight, shell, none, collect(priors, parameters), robust, fields)
+    known = collect(priors, parameters)
+    problem = Problem(model, parameters, batch, weight, shell, priors=known, loss=robust, fields=fields)
+    if finer is None:
+        return problem
+    return replace(problem, correction=Correction.constant(jnp.ones_like(signal), problem.start))
 
 
 def measured_light(batch: Batch) -> Float[np.ndarray, "image pixel w"]:
@@ -80,56 +93,96 @@ def check_finite(bad: Int[np.ndarray, "image 2"], names: Sequence[str], where: s
                 raise FitError(f"{name}: the model's {what} {where}: not finite in {lost} of the pixels used")
 
 
+Evaluate = Callable[[Coordinates, Linear, Problem], Linearisation]
+
+
 def corrected(
-    y: Coordinates, found: Linearisation, problem: Problem, finer: Model, near: Correction | None = None
+    y: Coordinates,
+    found: Linearisation,
+    problem: Problem,
+    finer: Model,
+    *,
+    near: Correction | None = None,
+    evaluate: Evaluate = evaluated,
 ) -> Problem:
     """``problem`` with the correction of its model by a finer one at ``y``, where ``found`` is the linearisation.
 
-    How the correction changes is that of ``near``, if that is given.
+    How the correction changes is that of ``near``, if that is given; if not, ``evaluate`` is asked a step away.
     """
-    coordinates = problem.parts(problem.split(y)[0])[0]
-    ratio = _ratio(y, found.radiance, problem, finer)
+    x, linear = problem.split(y)
+    here = _ratio(x, found.radiance, problem, finer)
+    ratio = jnp.where(jnp.isfinite(here), here, 1)
     if near is not None:
-        return replace(problem, correction=replace(near, ratio=ratio, at=coordinates))
-    here = replace(problem, correction=Correction.constant(ratio, coordinates))
-    for slot, (colour, step) in enumerate(_changing(y, found, here)):
-        x = y[: problem.size].at[: problem.parameters.size].add(jnp.where(problem.colours()[0] == colour, step, 0))
-        there = jnp.concatenate([x, y[problem.size :]])
-        shifted = evaluated(x, y[problem.size :], problem)
-        if np.asarray(shifted.bad).any():
+        return replace(problem, correction=replace(near, ratio=ratio, at=x))
+    correction, place = Correction.constant(ratio, x), 0
+    added = _added(y, found.radiance, problem, ratio - 1)
+    for step, seen in _open_steps(y, found, problem)[:TRIED]:
+        if place == DIRECTIONS or CHANGE * added * np.linalg.norm(step) < NEGLIGIBLE:
+            break
+        there = array(np.asarray(x, dtype=np.float64) + step, x.dtype)
+        shifted = evaluate(there, linear, problem)
+        slope = jnp.log(_ratio(there, shifted.radiance, problem, finer) / here)
+        lost = np.asarray(jnp.isfinite(here) & ~jnp.isfinite(slope) & problem.batch.used[..., None])
+        if np.asarray(shifted.bad).any() or lost.any():
             continue
-        slope = jnp.log(_ratio(there, shifted.radiance, problem, finer) / ratio) / step
-        old = here.correction
-        assert old is not None
-        new = replace(old, slope=old.slope.at[..., slot].set(slope), colour=old.colour.at[slot].set(colour))
-        here = replace(here, correction=new)
-    return here
+        slope = jnp.where(jnp.isfinite(slope), slope, 0)
+        if _added(y, found.radiance, problem, slope) < SLIGHT * seen:
+            continue
+        along = array(step / (step @ step), x.dtype)
+        correction = replace(
+            correction,
+            slope=correction.slope.at[..., place].set(slope),
+            along=correction.along.at[place].set(along),
+        )
+        place += 1
+    return replace(problem, correction=correction)
 
 
-def _ratio(y: Coordinates, radiance: Predicted, problem: Problem, finer: Model) -> Predicted:
-    x, mesh = problem.split(y)[0], problem.batch.mesh
+def _ratio(x: Coordinates, radiance: Predicted, problem: Problem, finer: Model) -> Predicted:
     found = outermost(model_error.ratio)(x, placed(problem), radiance, finer)
-    return gathered(jax.block_until_ready(found), mesh)
+    return gathered(jax.block_until_ready(found), problem.batch.mesh)
 
 
-def _changing(y: Coordinates, found: Linearisation, problem: Problem) -> list[tuple[int, float]]:
-    """The tangents along which the correction changes by more than the noise within an error bar, and a step along each."""
-    bars = model_error.standard_errors(reduce(y, found, problem))[: problem.parameters.size]
-    assert problem.correction is not None
-    added = np.asarray(outermost(light)(y, found.radiance, problem) * problem.weight, dtype=np.float64)
-    added = added * (np.asarray(problem.correction.ratio, dtype=np.float64) - 1)
-    colour, _ = problem.colours()
-    largest = [float(bars[colour == number].max()) for number in range(colour.max() + 1)]
-    size = CHANGE * float(np.linalg.norm(added))
-    chosen = sorted((n for n, bar in enumerate(largest) if size * bar > 1), key=lambda n: -largest[n])[:SLOPES]
-    _, upper = (np.asarray(limit)[: problem.parameters.size] for limit in problem.limits)
+def _added(y: Coordinates, radiance: Predicted, problem: Problem, part: Predicted) -> float:
+    """Such a part of the light, in units of the noise, over all pixels."""
+    lit = outermost(light)(y, radiance, problem)
+    return float(np.linalg.norm(np.asarray(lit * problem.weight * part, dtype=np.float64)))
+
+
+def _open_steps(y: Coordinates, found: Linearisation, problem: Problem) -> list[tuple[Float[np.ndarray, " x"], float]]:
+    """Steps of a standard error in the directions that the images leave most open first, at right angles to each other, and
+    what the images see of each in units of the noise: 1, but of a step that had to be shorter.
+
+    Exposures and pedestals follow. A direction that is not determined at all is left to the model that says so.
+    """
+    triangle = reduce(y, found, problem)[:, :-1]
+    of_x, of_linear = np.split(triangle, [problem.size], axis=1)
+    if of_linear.size:
+        of_x = of_x - of_linear @ np.linalg.lstsq(of_linear, of_x)[0]
+    _, singular, directions = np.linalg.svd(of_x)
+    lower, upper = (np.asarray(limit, dtype=np.float64) for limit in problem.limits)
+    x = np.asarray(y[: problem.size], dtype=np.float64)
     steps = []
-    for number in chosen:
-        step = min(largest[number], LONGEST)
-        own = colour == number
-        room = np.all(np.asarray(y)[: problem.parameters.size][own] + step <= upper[own])
-        steps.append((number, step if room else -step))
+    for value, direction in zip(singular[::-1], directions[::-1], strict=True):
+        if value > RANK_TOLERANCE * singular[0]:
+            # To the side where there is more room.
+            room, towards = max((_room(x, side * direction, lower, upper), side) for side in (1, -1))
+            length = min(1 / value, LONGEST, room)
+            if length > 0:
+                steps.append((towards * length * direction, float(value * length)))
     return steps
+
+
+def _room(
+    x: Float[np.ndarray, " x"],
+    direction: Float[np.ndarray, " x"],
+    lower: Float[np.ndarray, " x"],
+    upper: Float[np.ndarray, " x"],
+) -> float:
+    """How far one can go from ``x`` before a coordinate reaches its limit."""
+    moving = np.abs(direction) > 1e-6
+    ends = np.where(direction > 0, upper - x, lower - x)[moving] / direction[moving]
+    return float(max(np.min(ends, initial=np.inf), 0))
 
 
 def weighed(y: Coordinates, radiance: Predicted, problem: Problem) -> Problem:
@@ -162,11 +215,11 @@ def restored(
     problem = pose(batch, parameters, priors, loss, model, finer)
     problem = replace(problem, shell=outermost(planet_shell)(model, parameters))
     x, linear = problem.split(y)
+    problem = weighed(y, evaluated(x, linear, problem).radiance, problem)
     found = evaluated(x, linear, problem)
-    radiance = found.radiance
     if finer is not None:
         problem = corrected(y, found, problem, finer)
         assert problem.correction is not None
-        radiance = radiance * problem.correction.ratio
-    problem = weighed(y, radiance, problem)
-    return problem, evaluated(x, linear, problem)
+        problem = weighed(y, found.radiance * problem.correction.ratio, problem)
+        found = evaluated(x, linear, problem)
+    return problem, found

@@ -33,17 +33,21 @@ def slopes(
     nuisances = problem.batch.nuisances
     exposure = _scales(problem.split(y)[1], problem)[0][..., None]
     tangents, lit, one = columns[..., :-3], exposure * columns[..., -3:-2], columns[..., -2:-1]
+    first, turned = colour.max() + 1, colour.max() + 1 + len(nuisances.moving)
     touched = (channel == -1) | (np.arange(columns.shape[1])[:, None] == channel)
     of_atmosphere = np.where(touched[:, None], tangents[..., colour], 0) * exposure
     # No more than one component of an image's offset is a coordinate's.
     own = np.asarray(nuisances.offset_index)[..., None] == np.arange(nuisances.offsets)
-    turns = tangents[..., colour.max() + 1 :] @ own.astype(float)[:, None]
+    turns = tangents[..., first:turned] @ own.astype(float)[:, None]
     of_offsets = turns * np.asarray(nuisances.unit, float) * exposure
+    of_x = np.concatenate([of_atmosphere, of_offsets], axis=-1)
+    if problem.correction is not None:
+        of_x = of_x + exposure * (tangents[..., turned:] @ np.asarray(problem.correction.along, float))
     own = (np.asarray(nuisances.factor_index)[..., None] == np.arange(nuisances.factors)).any(axis=-2)
     of_factors = np.where(own[:, :, None], lit, 0)
     own = np.asarray(nuisances.pedestal_index)[..., None] == np.arange(nuisances.pedestals)
     of_pedestals = np.where(own[:, :, None], one, 0)
-    return np.concatenate([of_atmosphere, of_offsets, of_factors, of_pedestals], axis=-1)
+    return np.concatenate([of_x, of_factors, of_pedestals], axis=-1)
 
 
 def _scales(linear: Linear, problem: Problem) -> tuple[Float[np.ndarray, "image w 1"], Float[np.ndarray, "image w 1"]]:

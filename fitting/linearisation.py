@@ -50,7 +50,8 @@ class Linearisation(NamedTuple):
 
     rows: Float[Array, "image w k k"]
     """Triangular factors of [tangents, radiance, 1, residual] / sigma. A tangent for each colour of the parameters, then for
-    each component of the offsets that moves any image. A robust loss weights the pixels besides."""
+    each component of the offsets that moves any image, then for each direction along which a correction changes. A robust loss
+    weights the pixels besides."""
     linear: Linear
     """The linear nuisances for which the residuals, and the weights of a robust loss, are."""
     beyond: Float[Array, ""]
@@ -124,8 +125,10 @@ def _linearise(x: Coordinates, linear: Linear, problem: Problem) -> Linearisatio
         bad = bad + jnp.sum(used & jnp.stack(lost, axis=-1), axis=0)
         return (rows, beyond, pushes, bad), radiance
 
-    colours = int(problem.colours()[0].max()) + 1 + len(batch.nuisances.moving)
-    channels, size, dtype = batch.measured.shape[-1], colours + 3, batch.measured.dtype
+    tangents = int(problem.colours()[0].max()) + 1 + len(batch.nuisances.moving)
+    if problem.correction is not None:
+        tangents += len(problem.correction.along)
+    channels, size, dtype = batch.measured.shape[-1], tangents + 3, batch.measured.dtype
     forms = 0 if problem.fields is None else problem.fields.coefficient.shape[-1]
     empty = (
         jnp.zeros((channels, size, size), dtype),
@@ -170,7 +173,7 @@ def visit(
     """
     batch = problem.batch
     coordinates, moved = problem.parts(x)
-    colour, channel = problem.colours()
+    colour, _ = problem.colours()
     seeds = jnp.asarray(colour == np.arange(colour.max() + 1)[:, None], dtype=coordinates.dtype)
     air, of_air = _push(problem.parameters.atmosphere, (coordinates,), (seeds,))
     # What moves the view comes first among the offsets, shading next, and last a free aerosol.
@@ -186,7 +189,7 @@ def visit(
         pixels["modulation"] = tiled(batch.modulation(moved))
     if (correction := problem.correction) is not None:
         pixels |= {"correction": tiled(correction.ratio), "slope": tiled(correction.slope)}
-        away = correction.away(coordinates, colour, channel, batch.measured.shape[-1])
+        steps = correction.steps(x)
     if of_views is not None:
         # Images first, tiles next, then the components.
         pixels["turned"] = jnp.moveaxis(jax.vmap(tiled)(of_views.directions), 0, 2)
@@ -219,9 +222,7 @@ def visit(
                 tangents = jnp.concatenate([before, light[..., None] * tile["shading"], after], axis=-1)
                 light, tangents = light * tile["modulation"], tangents * tile["modulation"][..., None]
             if correction is not None:
-                light, tangents, tile["correction"] = apply(
-                    light, tangents, tile["correction"], tile["slope"], away, correction.colour
-                )
+                light, tangents, tile["correction"] = apply(light, tangents, tile["correction"], tile["slope"], steps)
             return add(carry, tile | own | {"radiance": light, "tangents": tangents})
 
         return jax.lax.scan(of_tile, empty, pixels)

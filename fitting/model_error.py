@@ -28,7 +28,7 @@ understated (``tests/benchmarks/accuracy.py``, ``recovery.py``)."""
 
 
 def ratio(x: Coordinates, problem: Problem, radiance: Predicted, finer: Model) -> Predicted:
-    """What ``finer`` expects over the ``radiance`` of the problem's own model; 1 where there is nothing to compare."""
+    """What ``finer`` expects over the ``radiance`` of the problem's own model; NaN where there is nothing to compare."""
     if problem.batch.mesh is None:
         return _ratio(x, problem, radiance, finer)
     everywhere, apart = PartitionSpec(), PartitionSpec(None, AXIS)
@@ -50,7 +50,7 @@ def _ratio(x: Coordinates, problem: Problem, radiance: Predicted, finer: Model) 
         wanted = wanted * batch.modulation(moved)
     known = batch.used[..., None] & (radiance > 0) & (wanted > 0)
     found = wanted / jnp.where(known, radiance, 1)
-    return jnp.where(known, jnp.clip(found, 1 / LARGEST_CORRECTION, LARGEST_CORRECTION), 1)
+    return jnp.where(known, jnp.clip(found, 1 / LARGEST_CORRECTION, LARGEST_CORRECTION), jnp.nan)
 
 
 def deviation(problem: Problem) -> Float[np.ndarray, "image w"]:
@@ -75,11 +75,6 @@ def _inverse(triangle: Factor) -> Float[np.ndarray, "n k"]:
     scale = np.where(length > 0, length, 1)
     inverse: Float[np.ndarray, "n k"] = np.linalg.pinv(triangle[:, :-1] / scale, rcond=RANK_TOLERANCE)
     return inverse / scale[:, None]
-
-
-def standard_errors(triangle: Factor) -> Float[np.ndarray, " n"]:
-    """Those of the coordinates by the noise alone, as far as they are determined."""
-    return np.linalg.norm(_inverse(triangle), axis=1)
 
 
 def covariance(best: Point, problem: Problem) -> Float[np.ndarray, "n n"]:

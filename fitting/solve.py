@@ -348,7 +348,8 @@ def _refined(run: _Run, found: _Found, finer: Model) -> tuple[_Found, Float[np.n
             place = np.asarray(here, dtype=np.float64)
             if slopes is not None and np.linalg.norm(metric @ (place - slopes[1])) > FAR:
                 slopes = None
-            problem = corrected(here, linearisation, alone, finer, slopes[0] if slopes else None)
+            near = slopes[0] if slopes else None
+            problem = corrected(here, linearisation, alone, finer, near=near, evaluate=run.evaluate)
             assert problem.correction is not None
             slopes = slopes or (problem.correction, place)
             best = run.search(on, problem, run.tolerance)

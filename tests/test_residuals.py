@@ -13,7 +13,7 @@ from plain_residuals import residuals
 
 from diffatmo.models import RayMarch
 from fitting.batch import rounded, stack
-from fitting.correction import SLOPES, Correction
+from fitting.correction import DIRECTIONS, Correction
 from fitting.least_squares import jacobian, pushes, triangle
 from fitting.linearisation import linearise
 from fitting.observation import sigma
@@ -25,10 +25,10 @@ NM = [680.0, 550.0, 440.0]
 TIE = {"mie_absorption": "start"}
 
 
-def problem(model, free, tie=None, exposure=("fixed", "fixed"), pixels=40):
+def problem(model, free, tie=None, exposure=("fixed", "fixed"), pixels=40, **options):
     mask = np.zeros((16, 64), bool)
     mask.flat[:: 16 * 64 // pixels] = True
-    images = toy_sky.observations(zeniths=(30.0, 80.0), mask=mask, exposure=exposure)
+    images = toy_sky.observations(zeniths=(30.0, 80.0), mask=mask, exposure=exposure, **options)
     # Only the pixels that are used, and one that is not, whatever it holds.
     images = [eqx.tree_at(lambda o: o.shown, image, image.used.copy()) for image in images]
     images[0].shown[0, 1] = True
@@ -149,28 +149,26 @@ def test_smooth_fields_are_orthogonal_with_mean_square_one():
 
 
 def test_a_correction_that_changes_has_its_part_of_the_derivatives(x64):
-    """Along a number of its own for each channel, and along one for all; the third place is free."""
-    ours, y = problem(toy_sky.Toy(), toy_sky.FREE, tie=TIE)
-    colour, channel = ours.colours()
-    (spectral, *_), (shared, *_) = colour[channel >= 0], colour[channel < 0]
+    """Along directions of any coordinates, those of the sun's place included."""
+    ours, y = problem(toy_sky.Toy(), toy_sky.FREE, tie=TIE, sun_offset="free", exposure=("free", "fixed"))
     random = np.random.default_rng(5)
     ratio = jnp.asarray(random.uniform(0.9, 1.1, ours.weight.shape))
-    slope = jnp.asarray(random.uniform(-0.5, 0.5, (*ours.weight.shape, SLOPES)))
-    at = y[: ours.parameters.size] - 0.1
-    ours = dataclasses.replace(ours, correction=Correction(ratio, at, slope, jnp.array([spectral, shared, -1])))
+    slope = jnp.asarray(random.uniform(-0.5, 0.5, (*ours.weight.shape, DIRECTIONS)))
+    along = jnp.asarray(random.uniform(-0.5, 0.5, (DIRECTIONS, ours.size)))
+    at = y[: ours.size] - 0.1
+    ours = dataclasses.replace(ours, correction=Correction(ratio, at, slope, along))
 
     def corrected(y):
-        radiance = predict(ours.sky, ours.parameters.atmosphere(ours.parts(y)[0]), ours.batch.views(ours.parts(y)[1]))
-        for number, (tangent, own) in enumerate(zip(colour, channel, strict=True)):
-            for place in np.flatnonzero(np.array([spectral, shared]) == tangent):
-                seen = (np.arange(3) == own) | (own < 0)
-                radiance = radiance * jnp.exp(seen * slope[..., place] * (y[number] - at[number]))
-        return whitened(y, radiance * ratio, ours).reshape(-1)
+        coordinates, moved = ours.parts(y[: ours.size])
+        radiance = predict(ours.sky, ours.parameters.atmosphere(coordinates), ours.batch.views(moved))
+        return whitened(y, radiance * ratio * jnp.exp(slope @ (along @ (y[: ours.size] - at))), ours).reshape(-1)
 
     plain = eqx.filter_jit(jax.jacfwd(corrected))(y)
     np.testing.assert_allclose(plain_residuals.jacobian(y, ours), plain, atol=1e-10 * np.abs(plain).max())
     found = linearise(*ours.split(y), ours)
-    assert np.sum(np.asarray(found.rows)[..., -1] ** 2) == pytest.approx(float(corrected(y) @ corrected(y)), rel=1e-10)
+    residual, rows = jacobian(y, found, ours)
+    assert residual @ residual == pytest.approx(float(corrected(y) @ corrected(y)), rel=1e-10)
+    np.testing.assert_allclose(rows.T @ rows, plain.T @ plain, rtol=1e-8, atol=1e-9 * np.abs(plain.T @ plain).max())
 
 
 @pytest.mark.parametrize("corrected", [False, True])
@@ -181,7 +179,7 @@ def test_a_push_is_the_jacobian_transposed(x64, corrected):
     ours = dataclasses.replace(
         ours,
         fields=Fields.of(ours.batch, 1),
-        correction=Correction.constant(correction, y[: ours.parameters.size]) if corrected else None,
+        correction=Correction.constant(correction, y[: ours.size]) if corrected else None,
     )
     got = pushes(y, linearise(*ours.split(y), ours), ours)
     coordinates, moved = ours.parts(ours.split(y)[0])

@@ -61,17 +61,21 @@ DIRECTIONS = np.asarray(CAMERA.directions())
 class Hasty(Toy):
     """The toy sky with an error that grows with the aerosol, and the toy sky itself as the finer model."""
 
+    growth: float = 15.0
+
     def finer(self):
         return Toy()
 
     def sky(self, atmosphere):
-        return HastySky(atmosphere)
+        return HastySky(atmosphere, self.growth)
 
 
 class HastySky(ToySky):
+    growth: float
+
     def radiance(self, *, altitude, view, sun):
         exact = super().radiance(altitude=altitude, view=view, sun=sun)
-        wrong = 1 - 15 * self.atmosphere.mie_scattering * jnp.exp(4 * (view @ sun - 1))[..., None]
+        wrong = 1 - self.growth * self.atmosphere.mie_scattering * jnp.exp(4 * (view @ sun - 1))[..., None]
         return Ray(exact.radiance * wrong, exact.transmittance)
 
 
