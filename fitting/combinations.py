@@ -55,6 +55,8 @@ def combinations(covariance: Float[np.ndarray, "q q"], estimates: Sequence[Estim
         for number, estimate in enumerate(estimates)
         if estimate.standard_error and estimate.value and not estimate.derived and not estimate.at_bound
     ]
+    # Of numbers of a field that are multiples of each other, the first stands for all.
+    known = [j for j in known if not any(_tied(covariance, estimates, i, j) for i in known if i < j)]
     pairs = [(i, j) for i in known for j in known if i < j and estimates[i].field != estimates[j].field]
     found = [pair for i, j in pairs if (pair := _combined(covariance, estimates, i, j)) is not None]
     found.sort(key=lambda pair: pair.error / min(pair.alone))
@@ -66,6 +68,12 @@ def combinations(covariance: Float[np.ndarray, "q q"], estimates: Sequence[Estim
             result.append(pair)
             told |= {pair.first, pair.second}
     return result
+
+
+def _tied(covariance: Float[np.ndarray, "q q"], estimates: Sequence[Estimate], i: int, j: int) -> bool:
+    """Whether two numbers of one field are one."""
+    together = abs(covariance[i, j]) > TIED * math.sqrt(covariance[i, i] * covariance[j, j])
+    return estimates[i].field == estimates[j].field and together
 
 
 def _combined(

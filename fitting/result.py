@@ -38,6 +38,11 @@ class FitResult(Findings):
         """What a notebook shows."""
         return tables.fragment(self)
 
+    @property
+    def doubts(self) -> list[str]:
+        """What makes the numbers doubtful, in sentences; none is no promise, but nothing that was looked for was found."""
+        return tables.doubts(self)
+
     def plot(self, what: str = "images") -> Figure:
         """A figure, drawn without pyplot: ``figure.savefig("fit.pdf")``; a notebook shows it as it is.
 

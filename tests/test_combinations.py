@@ -67,3 +67,14 @@ def test_a_fit_says_that_optical_depths_are_what_it_knows():
     found = fitting.fit(images, init=toy_sky.truth(), free=free, model=toy_sky.Toy())
     told = combinations(found.covariance, found.estimates)
     assert any({"rayleigh_scale_height", "rayleigh_scattering_440"} == {c.first, c.second} for c in told)
+
+
+def test_numbers_that_are_one_are_told_once():
+    """A tie makes two wavelengths of a field one number: the first stands for both."""
+    relative = spread(0.006, 0.22)[np.ix_([0, 0, 1], [0, 0, 1])]
+    given = [
+        Estimate(name, field, None, "", 1.0, error, None)
+        for name, field, error in zip(("a_680", "a_550", "b"), ("a", "a", "b"), np.sqrt(np.diag(relative)), strict=True)
+    ]
+    (found,) = combinations(relative, given)
+    assert {found.first, found.second} == {"a_680", "b"}

@@ -284,7 +284,7 @@ def test_model_error_covers_a_fifth_of_the_correction():
     # A correction of which a fifth is in the error bars has moved a number by five of them or so.
     assert 2 < found.moved < 10
     assert blind.moved == 0
-    assert any("finer self has moved" in doubt for doubt in tables.doubts(dataclasses.replace(found, moved=7.2)))
+    assert any("finer self has moved" in doubt for doubt in dataclasses.replace(found, moved=7.2).doubts)
     assert not any("finer self" in doubt for doubt in tables.doubts(dataclasses.replace(found, moved=5.0)))
 
 
