@@ -95,8 +95,14 @@ def _together(part: Linearisation) -> Linearisation:
     rows = jax.lax.all_gather(part.rows, AXIS, axis=2, tiled=True)
     total = lambda value: jax.lax.psum(value, AXIS)
     return part._replace(
-        rows=jnp.linalg.qr(rows, mode="r"), beyond=total(part.beyond), pushes=total(part.pushes), bad=total(part.bad)
+        rows=jax.lax.map(_triangles, rows), beyond=total(part.beyond), pushes=total(part.pushes), bad=total(part.bad)
     )
+
+
+def _triangles(columns: Float[Array, "w row k"]) -> Float[Array, "w k k"]:
+    """The triangular factor of each channel, one after the other: jaxlib hands a batch of them to the threads that the devices
+    of a machine share, and waits; where every thread waits so, none is left to do it."""
+    return jax.lax.map(lambda channel: jnp.linalg.qr(channel, mode="r"), columns)
 
 
 def _linearise(x: Coordinates, linear: Linear, problem: Problem) -> Linearisation:
@@ -120,7 +126,7 @@ def _linearise(x: Coordinates, linear: Linear, problem: Problem) -> Linearisatio
             robust, total = problem.loss(off)
             columns = columns * jnp.sqrt(robust)[:, None, None]
             beyond = beyond + total - jnp.sum(columns[..., -1] ** 2)
-        rows = jnp.linalg.qr(jnp.concatenate([rows, jnp.swapaxes(columns, 0, 1)], axis=1), mode="r")
+        rows = _triangles(jnp.concatenate([rows, jnp.swapaxes(columns, 0, 1)], axis=1))
         lost = [~jnp.isfinite(values).reshape(len(used), -1).all(axis=1) for values in (radiance, tangents)]
         bad = bad + jnp.sum(used & jnp.stack(lost, axis=-1), axis=0)
         return (rows, beyond, pushes, bad), radiance
