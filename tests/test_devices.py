@@ -42,6 +42,8 @@ def assert_the_same(found, alone):
     # A pedestal may be near 0.
     np.testing.assert_allclose(others, values, rtol=1e-5, atol=1e-3 * errors.min())
     np.testing.assert_allclose(their_errors, errors, rtol=1e-3)
+    size = np.sqrt(np.diag(alone["gram"]))
+    np.testing.assert_allclose(found["gram"] / np.outer(size, size), alone["gram"] / np.outer(size, size), atol=1e-5)
 
 
 def test_eight_devices(tmp_path, alone):
