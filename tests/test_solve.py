@@ -288,24 +288,28 @@ def test_model_error_covers_a_fifth_of_the_correction():
     assert not any("finer self" in doubt for doubt in tables.doubts(dataclasses.replace(found, moved=5.0)))
 
 
-def test_error_bars_are_those_of_the_finer_model(monkeypatch):
-    """One picture hardly tells aerosol from its scale height, and of the little that does the crude model has three times as
-    much. To a tenth: the changes of the correction are measured over an error bar."""
-    monkeypatch.setattr(model_error, "REMAINING", 1e-6)
-    images = toy_sky.observations(zeniths=(60.0,))
-    free = [
+SIX = {
+    "free": [
         "mie_scattering",
         "mie_absorption",
         "mie_g",
         "rayleigh_scattering",
         "rayleigh_scale_height",
         "mie_scale_height",
-    ]
-    tie = {"mie_scattering": "grey", "mie_absorption": "grey", "rayleigh_scattering": "lambda^-4"}
+    ],
+    "tie": {"mie_scattering": "grey", "mie_absorption": "grey", "rayleigh_scattering": "lambda^-4"},
+}
+
+
+def test_error_bars_are_those_of_the_finer_model(monkeypatch):
+    """One picture hardly tells aerosol from its scale height, and of the little that does the crude model has three times as
+    much. To a tenth: the changes of the correction are measured over an error bar."""
+    monkeypatch.setattr(model_error, "REMAINING", 1e-6)
+    images = toy_sky.observations(zeniths=(60.0,))
     bars = lambda result: {e.name: e.standard_error for e in result.parameters if not e.derived}
 
     def fitted(model):
-        result = fit(images, init=toy_sky.truth(), free=free, tie=tie, model=model)
+        result = fit(images, init=toy_sky.truth(), **SIX, model=model)
         assert result.converged, result.message
         return result
 
@@ -318,7 +322,7 @@ def test_error_bars_are_those_of_the_finer_model(monkeypatch):
     assert ours == pytest.approx(best, rel=0.2)
     # Without these changes.
     monkeypatch.setattr(evaluation, "CHANGE", 0.0)
-    blind = fit(images, init=toy_sky.truth(), free=free, tie=tie, model=Hasty())
+    blind = fit(images, init=toy_sky.truth(), **SIX, model=Hasty())
     assert bars(blind)["mie_scale_height"] < bars(exact)["mie_scale_height"] / 2
 
 
@@ -333,18 +337,7 @@ def test_error_bars_of_a_series_are_those_of_the_finer_model():
         images += toy_sky.observations(
             seed=number, zeniths=(30.0 + 10 * number,), atmosphere=air, aerosol="free", time_h=hour
         )
-    free = [
-        "mie_scattering",
-        "mie_absorption",
-        "mie_g",
-        "rayleigh_scattering",
-        "rayleigh_scale_height",
-        "mie_scale_height",
-    ]
-    tie = {"mie_scattering": "grey", "mie_absorption": "grey", "rayleigh_scattering": "lambda^-4"}
-    exact, crude = (
-        fit(images, init=toy_sky.truth(), free=free, tie=tie, model=model) for model in (Toy(), Hasty(growth=2.0))
-    )
+    exact, crude = (fit(images, init=toy_sky.truth(), **SIX, model=model) for model in (Toy(), Hasty(growth=2.0)))
     for ours, best in zip(crude.estimates, exact.estimates, strict=True):
         assert ours.standard_error == pytest.approx(best.standard_error, rel=0.2), ours.name
         assert ours.value == pytest.approx(best.value, abs=0.3 * best.standard_error), ours.name
