@@ -90,6 +90,15 @@ def safe_arccos(x: Float[Array, "..."]) -> Float[Array, "..."]:
     return jnp.where(inside, jnp.arccos(jnp.where(inside, x, 0)), jnp.where(x > 0, 0, jnp.pi))
 
 
+def arcsinh(x: Float[Array, "..."]) -> Float[Array, "..."]:
+    """arcsinh(x) to an *absolute* rounding error, with one logarithm: XLA computes three, so that small ones are exact."""
+    negative = x < 0
+    # Not abs(x), whose derivative at 0 is 0.
+    size = jnp.where(negative, -x, x)
+    value = jnp.log(size + jnp.sqrt(size * size + 1))
+    return jnp.where(negative, -value, value)
+
+
 def safe_norm(x: Float[Array, "... n"]) -> Float[Array, "..."]:
     """Euclidean length over the last axis; the derivative is 0 at the origin."""
     return safe_sqrt(jnp.sum(x * x, axis=-1))

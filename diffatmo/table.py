@@ -6,6 +6,8 @@ again and again. Interpolation is Lagrange's through the four nearest nodes (fou
 [0, 1] extrapolate the end cubic.
 """
 
+from typing import NamedTuple
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -21,34 +23,48 @@ def unstretch(value: Float[Array, "..."], linear: float) -> Float[Array, "..."]:
     return 2 * value / (linear + jnp.sqrt(linear * linear + 4 * (1 - linear) * value))
 
 
-def _cubic(unit: Float[Array, "..."], count: int) -> tuple[Int[Array, "..."], tuple[Float[Array, "..."], ...]]:
+class Stencil(NamedTuple):
+    """Four neighbouring nodes of an axis, and the weight of each: a small thing to keep where dense rows are a large one."""
+
+    first: Int[Array, "..."]
+    """The first of the nodes."""
+    weights: tuple[Float[Array, "..."], ...]
+
+    def scaled(self, factor: Float[Array, "..."]) -> "Stencil":
+        """What is looked up, times ``factor``."""
+        return Stencil(self.first, tuple(factor * weight for weight in self.weights))
+
+    def rows(self, count: int, axis: int = -1) -> Float[Array, "... n"]:
+        """The weights as dense rows over all ``count`` nodes, on a new ``axis``, for interpolation by matrix product."""
+        axis = axis % (self.first.ndim + 1)
+        nodes = jnp.expand_dims(jnp.arange(count), [a for a in range(self.first.ndim + 1) if a != axis])
+        offset = nodes - jnp.expand_dims(self.first, axis)
+        rows = jnp.zeros((), self.weights[0].dtype)
+        for number, weight in enumerate(self.weights):
+            rows = jnp.where(offset == number, jnp.expand_dims(weight, axis), rows)
+        return rows
+
+
+def cubic(unit: Float[Array, "..."], count: int) -> Stencil:
+    """The nodes and Lagrange weights for interpolation at ``unit`` in ``count`` equidistant nodes on [0, 1]."""
     position = unit * (count - 1)
     first = jnp.clip(jnp.floor(position).astype(jnp.int32) - 1, 0, count - 4)
     t = position - first
-    return first, (
-        (t - 1) * (t - 2) * (3 - t) / 6,
-        t * (t - 2) * (t - 3) / 2,
-        t * (t - 1) * (3 - t) / 2,
-        t * (t - 1) * (t - 2) / 6,
+    return Stencil(
+        first,
+        (
+            (t - 1) * (t - 2) * (3 - t) / 6,
+            t * (t - 2) * (t - 3) / 2,
+            t * (t - 1) * (3 - t) / 2,
+            t * (t - 1) * (t - 2) / 6,
+        ),
     )
 
 
 def cubic_weights(unit: Float[Array, "..."], count: int) -> tuple[Int[Array, "..."], Float[Array, "... 4"]]:
-    """First node and the four Lagrange weights for interpolation at ``unit`` in ``count`` equidistant nodes on [0, 1]."""
-    first, weights = _cubic(unit, count)
+    """The first node of :func:`cubic`, and its weights in one array."""
+    first, weights = cubic(unit, count)
     return first, jnp.stack(weights, axis=-1)
-
-
-def cubic_rows(unit: Float[Array, "..."], count: int, axis: int = -1) -> Float[Array, "... n"]:
-    """The same weights as dense rows over all nodes, on a new ``axis``, for interpolation by matrix product."""
-    first, weights = _cubic(unit, count)
-    axis = axis % (unit.ndim + 1)
-    nodes = jnp.expand_dims(jnp.arange(count), [a for a in range(unit.ndim + 1) if a != axis])
-    offset = nodes - jnp.expand_dims(first, axis)
-    rows = jnp.zeros((), unit.dtype)
-    for number, weight in enumerate(weights):
-        rows = jnp.where(offset == number, jnp.expand_dims(weight, axis), rows)
-    return rows
 
 
 def interpolate(

@@ -16,6 +16,7 @@ from diffatmo import numerics
         (numerics.safe_sqrt, [-1.0, 0.0, 1e-30, 2.0]),
         (numerics.safe_log, [-1.0, 0.0, 1e-30, 2.0]),
         (numerics.safe_arccos, [-2.0, -1.0, 0.3, 1.0, 2.0]),
+        (numerics.arcsinh, [-1e9, -1.0, 0.0, 1e-30, 1e9]),
         (lambda x: numerics.safe_divide(1 + x, x), [0.0, 2.0]),
         (lambda x: numerics.bounded_divide(1 + x, x), [0.0, 1e-30, -1e-30, 2.0]),
         (lambda x: numerics.safe_norm(jnp.stack([x, x])), [0.0, 1.0]),
@@ -33,6 +34,15 @@ def test_values_agree_with_numpy_where_it_has_one():
     np.testing.assert_allclose(numerics.safe_sqrt(x), np.sqrt(x), rtol=1e-6)
     np.testing.assert_allclose(numerics.safe_log(x), np.log(x), rtol=1e-6)
     np.testing.assert_allclose(numerics.safe_arccos(x), np.arccos(x), rtol=1e-5)
+
+
+@pytest.mark.parametrize(("dtype", "bound"), [(np.float32, 6e-7), (np.float64, 1e-14)])
+def test_arcsinh_is_numpys_and_so_is_its_slope(x64, dtype, bound):
+    """To three roundings of values up to 3; 0 is a point like any other."""
+    x = jnp.asarray(np.append(np.linspace(-10, 10, 400), 0), dtype)
+    np.testing.assert_allclose(numerics.arcsinh(x), np.arcsinh(np.asarray(x, float)), rtol=0, atol=bound)
+    slope = jax.vmap(jax.grad(numerics.arcsinh))(x)
+    np.testing.assert_allclose(slope, 1 / np.hypot(np.asarray(x, float), 1), rtol=0, atol=bound)
 
 
 def test_scaled_erfcx_agrees_with_scipy(x64):

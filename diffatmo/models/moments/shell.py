@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 from diffatmo import geometry, rays, table
 from diffatmo._types import Altitude, Cosine, Scalar
 from diffatmo.models.moments.angular import cosines, orders, pairs, plane, polar, projection, relative_nu
-from diffatmo.numerics import gauss_legendre, safe_divide
+from diffatmo.numerics import arcsinh, gauss_legendre, safe_divide
 from diffatmo.rays import Nodes
 
 ALTITUDE_LINEAR = 0.04
@@ -61,15 +61,14 @@ class Rays(eqx.Module):
 class Ways(NamedTuple):
     """What takes moments at the nodes of the shell to the light scattered along ``k`` rays.
 
-    The weights of the interpolation in the sun's height are made from ``sun_unit`` where they are used: as a table they would
-    be the largest array by far. ``suns`` stands for one or more axes over suns; in :class:`Links` axis ``i`` comes first.
+    The interpolation in the sun's height is kept as stencils, and made dense where it is used: all its rows would be the
+    largest array by far. ``suns`` stands for one or more axes over suns; in :class:`Links` axis ``i`` comes first.
     """
 
     altitude_rows: Float[Array, "..."]
     """Interpolation in altitude; k n h."""
-    sun_unit: Float[Array, "..."]
-    """Unit coordinate of the sun's height at the nodes along the ray; k n suns, as what follows."""
-    dusk: Float[Array, "..."]
+    sun: table.Stencil
+    """Interpolation in the sun's height at the nodes along the ray, times ``dusk`` there; k n suns, as what follows."""
     w: Float[Array, "..."]
     """sinθ sinθ_s cos φ."""
     q: Float[Array, "..."]
@@ -122,7 +121,7 @@ def sun_range(radius: Scalar, top: Altitude) -> tuple[Scalar, Scalar]:
     scale = grazing(radius, top)
     dip = jnp.arctan(-geometry.horizon_mu(top, radius) / safe_divide(radius, radius + top))
     lowest = -jnp.sin(jnp.minimum(jnp.radians(18.0) + dip, jnp.radians(80.0)))
-    return jnp.arcsinh(lowest / scale), jnp.arcsinh(0.985 / scale)
+    return arcsinh(lowest / scale), arcsinh(0.985 / scale)
 
 
 def altitude_unit(altitude: Altitude, top: Altitude) -> Float[Array, "..."]:
@@ -133,7 +132,7 @@ def altitude_unit(altitude: Altitude, top: Altitude) -> Float[Array, "..."]:
 def sun_unit(mu_s: Cosine, radius: Scalar, top: Altitude) -> Float[Array, "..."]:
     """Unit coordinate of a sun height; not below 0, where the sky is dark."""
     low, high = sun_range(radius, top)
-    return jnp.maximum((jnp.arcsinh(mu_s / grazing(radius, top)) - low) / (high - low), 0)
+    return jnp.maximum((arcsinh(mu_s / grazing(radius, top)) - low) / (high - low), 0)
 
 
 def dusk(mu_s: Cosine, scale: Scalar) -> Float[Array, "..."]:
@@ -247,28 +246,31 @@ def _links(
     mu_here = geometry.mu_along(
         altitude[:, None, None, None], here.mu[..., None, None], here.nodes.distance, here.nodes.altitude, radius
     )
-    altitude_rows = table.cubic_rows(altitude_unit(here.nodes.altitude, top), altitude.size)
+    altitude_rows = table.cubic(altitude_unit(here.nodes.altitude, top), altitude.size).rows(altitude.size)
     angular = polar(max(degrees), mu_here)
     # The sun's height at every node of every set, then at the ground.
     suns = [part for r in sets for part in (r.mu_s_here, r.mu_s_ground)]
     flat = jnp.concatenate([part.reshape(altitude.size, -1, mu_s.size) for part in suns], axis=1)
-    ends = np.cumsum([part[0, ..., 0].size for part in suns])[:-1]
-    units, dusks = (
-        [part.reshape(sun.shape) for part, sun in zip(jnp.split(x, ends, axis=1), suns, strict=True)]
-        for x in (sun_unit(flat, radius, top), dusk(flat, grazing(radius, top)))
-    )
+    ends = np.cumsum([part[0, ..., 0].size for part in suns])
+    stencil = table.cubic(sun_unit(flat, radius, top), mu_s.size).scaled(dusk(flat, grazing(radius, top)))
+    stencils = [
+        jax.tree.map(lambda x, sun=sun, end=end: x[:, end - sun[0, ..., 0].size : end].reshape(sun.shape), stencil)
+        for sun, end in zip(suns, ends, strict=True)
+    ]
     found, first = [], 0
     for number, (r, degree) in enumerate(zip(sets, degrees, strict=True)):
         part = slice(first, first + r.mu.shape[1])
         first = part.stop
-        unit, unit_ground, dusk_here, dusk_ground = (x[2 * number + at] for x in (units, dusks) for at in (0, 1))
+        sun_here, sun_ground = stencils[2 * number : 2 * number + 2]
         nu = relative_nu(r.mu[..., None, None], mu_s, cosines(r.azimuths, altitude.dtype)[:, None])
         there = _at_nodes(mu_here[:, part], r.steps)[..., None, None]
         ways = Ways(
-            _at_nodes(altitude_rows[:, part], r.steps), unit, dusk_here, *plane(there, r.mu_s_here, nu[:, :, None])
+            _at_nodes(altitude_rows[:, part], r.steps),
+            sun_here,
+            *plane(there, r.mu_s_here, nu[:, :, None]),
         )
         angular_here = _at_nodes(angular[:, part, ..., : len(pairs(degree))], r.steps)
-        ground_rows = table.cubic_rows(unit_ground, mu_s.size, axis=2) * dusk_ground[:, :, None]
+        ground_rows = sun_ground.rows(mu_s.size, axis=2)
         found.append(Links(rays=r, ways=ways, polar=angular_here, ground_rows=ground_rows))
     return found
 

@@ -232,11 +232,10 @@ class MomentsView(View):
         start, along = altitude[:, None, None], (nodes.distance[..., None], nodes.altitude[..., None], radius)
         mu_here = geometry.mu_along(start, mu[:, None, None], *along)
         mu_s_here = geometry.mu_s_along(start, mu_s[:, None], nu[:, None], *along)
-        altitude_rows = table.cubic_rows(shell.altitude_unit(nodes.altitude), shell.altitude.size)
+        altitude_rows = table.cubic(shell.altitude_unit(nodes.altitude), shell.altitude.size).rows(shell.altitude.size)
         ways = Ways(
             altitude_rows,
-            shell.sun_unit(mu_s_here),
-            dusk(mu_s_here, shell.grazing()),
+            table.cubic(shell.sun_unit(mu_s_here), shell.mu_s.size).scaled(dusk(mu_s_here, shell.grazing())),
             *plane(mu_here, mu_s_here, nu[:, None]),
         )
         weight = sky._source(nodes.altitude) * sky._survival(altitude, mu, nodes, size.steps)[..., None, :]

@@ -162,7 +162,7 @@ def gather(
     ends = np.cumsum(np.bincount(m_of))
     there = jnp.einsum("knh,hcws->kncws", ways.altitude_rows, moments[:, order]) * weight[:, :, order, :, None]
     by_m = jnp.stack([jnp.sum(part, axis=2) for part in jnp.split(there, ends[:-1], axis=2)], axis=2)
-    sun_rows = table.cubic_rows(ways.sun_unit, moments.shape[-1], axis=2) * ways.dusk[:, :, None]
+    sun_rows = ways.sun.rows(moments.shape[-1], axis=2)
     here = jnp.einsum("knmws,kns...->knmw...", by_m, sun_rows)
     around = azimuthal(degree, ways.w, ways.q)
     # One sum over m inside, one over n outside: a sum for each m would go through the arrays as often.
