@@ -147,6 +147,8 @@ def plot(found: dict[str, list[tuple[int, dict[str, float]]]], file: Path) -> No
         below.loglog(x, [case["before"] / 1e9 for _, case in cases], "s:", label="before the fit")
         below.loglog(x, [case["input"] / 1e9 for _, case in cases], "^:", label="images alone")
         below.set_xlabel(name)
+        below.set_xticks(x, [f"{number:g}" for number in x])
+        below.minorticks_off()
     axes[0, 0].set_ylabel("s")
     axes[1, 0].set_ylabel("GB")
     for row in axes:
