@@ -3,6 +3,7 @@
 import io
 import math
 from collections.abc import Mapping, Sequence
+from itertools import groupby
 from statistics import NormalDist
 from typing import Any
 
@@ -41,6 +42,9 @@ def as_png(figure: Figure) -> bytes:
     figure.savefig(buffer, format="png", dpi=DPI)
     return buffer.getvalue()
 
+
+TIED = 1e-6
+"""How little less than fully correlated numbers are that a tie makes one."""
 
 _MASKED = (0.82, 0.83, 0.85)
 """Grey of the pixels that were not used."""
@@ -303,9 +307,21 @@ def _profile_panel(axes: Axes, profile: Profile) -> None:
     axes.tick_params(labelsize=8)
 
 
-def correlation_figure(result: Findings) -> Figure:
-    """Correlation matrix of the fitted numbers."""
+def _untied(result: Findings) -> tuple[list[str], Float[np.ndarray, "n n"]]:
+    """The correlations of :attr:`~fitting.findings.Findings.fitted_correlation` between numbers that can differ."""
     names, matrix = result.fitted_correlation
+    shown: dict[str, int] = {}
+    for _, of_field in groupby(range(len(names)), key=lambda number: result.estimate(names[number]).field):
+        numbers = list(of_field)
+        one = len(numbers) > 1 and np.all(matrix[np.ix_(numbers, numbers)] > 1 - TIED)
+        shown |= {result.estimate(names[n]).field if one else names[n]: n for n in (numbers[:1] if one else numbers)}
+    kept = list(shown.values())
+    return list(shown), matrix[np.ix_(kept, kept)]
+
+
+def correlation_figure(result: Findings) -> Figure:
+    """Correlation matrix of the fitted numbers; what a tie makes one number of a field is shown once, by the field's name."""
+    names, matrix = _untied(result)
     size = 2.6 + 0.2 * len(names)
     figure = Sheet(figsize=(size + 0.6, size), layout="constrained")
     axes = figure.subplots()

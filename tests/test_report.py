@@ -331,5 +331,7 @@ def test_a_field_that_a_tie_makes_one_number_has_one_row():
     assert len(of_scattering) == 1
     assert of_scattering[0][1] == "all"
     assert not any(words[:1] == [nm] for words in rows for nm in ("680", "550", "440"))
+    shown = [label.get_text() for label in tied.plot("correlation").axes[0].get_yticklabels()]
+    assert shown == ["mie_scattering", "mie_g"]
     # What is read by machines has all.
     assert [row["wavelength_nm"] for row in to_rows(tied) if row["field"] == "mie_scattering"] == [680, 550, 440]

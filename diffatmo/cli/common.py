@@ -1,6 +1,8 @@
 """What the subcommands share: their error, the choice of a model, and the checks of what they read and write."""
 
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -58,6 +60,17 @@ def make_console(*, quiet: bool = False) -> "Console":
 
     width = None if sys.stdout.isatty() else PLAIN_WIDTH
     return Console(width=width, highlight=False, markup=False, quiet=quiet)
+
+
+@contextmanager
+def waiting(console: "Console", what: str) -> Iterator[None]:
+    """Say what takes its time: beside something that turns in a terminal, elsewhere as a line."""
+    if console.is_terminal:
+        with console.status(what):
+            yield
+    else:
+        console.print(what, soft_wrap=True)
+        yield
 
 
 def model_options(command: Any) -> Any:

@@ -8,7 +8,7 @@ import click
 
 from diffatmo import folders
 from diffatmo.cli import keys
-from diffatmo.cli.common import MODELS, InputError, make_model, overwrite_option, read_atmosphere
+from diffatmo.cli.common import MODELS, InputError, make_console, make_model, overwrite_option, read_atmosphere, waiting
 from diffatmo.cli.keys import CAMERA_KEYS, PLACE_KEYS
 from diffatmo.cli.render import DEFAULTS, SIZE, make_scene
 
@@ -95,17 +95,16 @@ def compare(
     names = list(dict.fromkeys([truth, *models]))
     air = read_atmosphere(atmosphere)
     folders.prepare(output, names=FILES, prefixes=PREFIXES, overwrite=overwrite)
-    from rich.console import Console
 
     from diffatmo import comparison
     from diffatmo import scene as scenes
     from diffatmo.models import PathTrace
 
     scene = make_scene(air, given, width, height)
-    console = Console(width=None if Console().is_terminal else 120)
+    console = make_console()
     outcomes: dict[str, Outcome] = {}
     for name in names:
-        with console.status(f"{name} …"):
+        with waiting(console, f"{name} …"):
             chosen = make_model(name, samples=samples if name == "pathtrace" else None)
             outcomes[name] = comparison.run(scene, chosen)
             # At once: the next model may take long, and may be interrupted.

@@ -8,7 +8,7 @@ import click
 
 from diffatmo import folders
 from diffatmo.cli import keys
-from diffatmo.cli.common import InputError, check_output, make_console, overwrite_option, read_atmosphere
+from diffatmo.cli.common import InputError, check_output, make_console, overwrite_option, read_atmosphere, waiting
 from diffatmo.cli.keys import CAMERA_KEYS, PLACE_KEYS, Number
 from diffatmo.cli.render import DEFAULTS, SIZE, make_scene
 
@@ -100,14 +100,13 @@ def export(
     keys.check_camera_options(options)
     air = read_atmosphere(atmosphere)
     folders.prepare(output, names=FOLDERS, overwrite=overwrite)
-    from rich.console import Console
     from rich.table import Table
 
     from diffatmo import export as tables
     from diffatmo import imageio
 
-    console = Console(width=None if Console().is_terminal else 120)
-    with console.status("computing the tables …"):
+    console = make_console()
+    with waiting(console, "computing the tables …"):
         if luts == "bruneton":
             textures, kind, facts = _bruneton(air, parameterisation or PARAMETERISATIONS[0], orders or DEFAULT_ORDERS)
         else:
@@ -137,7 +136,7 @@ def _export_preset(atmosphere: str, preset: str, output: Path, *, overwrite: boo
 
     console = make_console()
     lost = presets.losses(air, preset)
-    with console.status("comparing the skies …"):
+    with waiting(console, "comparing the skies …"):
         skies = presets.sky_losses(air, preset)
     text = presets.write(air, preset, remarks=presets.remarks(preset, lost, skies))
     with imageio.atomic_write(output, overwrite=overwrite) as path:

@@ -17,7 +17,6 @@
 """
 
 import math
-import sys
 import textwrap
 from collections.abc import Sequence
 from dataclasses import asdict, replace
@@ -27,7 +26,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from diffatmo import folders
-from diffatmo.cli.common import PLAIN_WIDTH, InputError, overwrite_option, read_atmosphere
+from diffatmo.cli.common import InputError, make_console, overwrite_option, read_atmosphere, waiting
 from diffatmo.cli.jobs import Job, prepare
 from diffatmo.cli.keys import Number, read
 from diffatmo.cli.running import fitting_model
@@ -127,11 +126,9 @@ def plan(
     }
     names = None if aims is None else [name.strip() for name in aims.split(",") if name.strip()]
     folders.prepare(output, names=FILES, overwrite=overwrite)
-    from rich.console import Console
-
-    console = Console(width=None if sys.stdout.isatty() else PLAIN_WIDTH, highlight=False)
+    console = make_console()
     chosen = exposure or (job.observations[-1].exposure if job.observations else "fixed")
-    with console.status("compiling the model and its derivatives, then weighing the shots …"):
+    with waiting(console, "compiling the model and its derivatives, then weighing the shots …"):
         found = _find(job, at, names, shots, suns, chosen, given)
     _write(output, found, chosen)
     console.print(_ranking(found, chosen))

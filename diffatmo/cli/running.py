@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from diffatmo.cli.common import INTERRUPTED, make_console, make_model, printable
+from diffatmo.cli.common import INTERRUPTED, make_console, make_model, printable, waiting
 from diffatmo.cli.jobs import Job
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ def run(job: Job, directory: Path, *, overwrite: bool, quiet: bool = False, writ
     def show_point(name: str, value: float, growth: float) -> None:
         console.print(f"  {name} = {value:<10.5g}  Δχ² {growth:.3g}")
 
-    with console.status("compiling the model and its derivatives, then fitting …"):
+    with waiting(console, "compiling the model and its derivatives, then fitting …"):
         result = fitting.fit(
             job.observations,
             init=job.init,
