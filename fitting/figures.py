@@ -240,7 +240,8 @@ def overview_figure(result: Findings) -> Figure:
     axes = figure.subplots(len(heights), 3, squeeze=False, height_ratios=heights)
     for row, observation, fitted, residual in zip(axes, result.observations, result.fitted, residuals, strict=True):
         pictures = (*developed(observation, fitted, wavelengths), diverging(np.mean(residual, axis=-1), scale))
-        for panel, picture, title in zip(row, pictures, (observation.name, "fitted", "residual"), strict=True):
+        titles = (observation.name, "fitted", "residual, mean of all channels")
+        for panel, picture, title in zip(row, pictures, titles, strict=True):
             panel.imshow(picture, interpolation="nearest")
             bare(panel, title)
     _residual_bar(figure, list(axes[:, 2]), scale)
