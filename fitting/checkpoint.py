@@ -6,9 +6,6 @@ everything said about the fit; another fit refuses it.
 
 import hashlib
 import json
-import tokenize
-import zipfile
-import zlib
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,11 +14,9 @@ import numpy as np
 from jaxtyping import Float
 
 from diffatmo import imageio
-from fitting._errors import FitError
+from fitting._errors import DAMAGED, FitError
 
 FILE = "checkpoint.npz"
-
-_DAMAGED = (ValueError, KeyError, TypeError, EOFError, SyntaxError, tokenize.TokenError, zipfile.BadZipFile, zlib.error)
 
 
 class Checkpoint(NamedTuple):
@@ -33,6 +28,8 @@ class Checkpoint(NamedTuple):
     """Inverse of the damping of the next step."""
     final: bool
     """Whether sigma comes from the fitted signal already."""
+    understated: float
+    """Factor between the residuals and the noise, as far as the fit knows it."""
     history: list[dict[str, Any]]
     """A row for each step."""
 
@@ -49,9 +46,7 @@ def digest(*parts: Any) -> str:
 
 def save(path: Path, fit: str, checkpoint: Checkpoint) -> None:
     """Replace the file at ``path``. Raises :class:`FitError` if it cannot be written."""
-    record = json.dumps(
-        {"fit": fit, "step_size": checkpoint.step_size, "final": checkpoint.final, "history": checkpoint.history}
-    )
+    record = json.dumps({"fit": fit} | {key: value for key, value in checkpoint._asdict().items() if key != "y"})
     try:
         with imageio.atomic_write(path, overwrite=True) as temporary, temporary.open("wb") as file:
             np.savez(file, allow_pickle=False, y=checkpoint.y, record=np.frombuffer(record.encode(), np.uint8))
@@ -66,10 +61,10 @@ def load(path: Path, fit: str) -> Checkpoint | None:
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             y, record = archive["y"], json.loads(archive["record"].tobytes())
-        owner, checkpoint = record["fit"], Checkpoint(y, record["step_size"], record["final"], record["history"])
+        owner, checkpoint = record.pop("fit"), Checkpoint(y, **record)
     except OSError as error:
         raise FitError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except _DAMAGED as error:
+    except DAMAGED as error:
         raise FitError(f"{path}: not a checkpoint of a fit; remove it to start anew") from error
     if owner != fit:
         raise FitError(f"{path}: belongs to a fit of other images or options; remove it to start anew")

@@ -101,7 +101,10 @@ def reduce(y: Coordinates, linearisation: Linearisation, problem: Problem) -> Fa
 
 
 def known_rows(y: Coordinates, problem: Problem) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k n"]]:
-    """Residuals of what is known besides the images, and their derivatives: of the priors, and of the offsets."""
+    """Residuals of what is known besides the images, and their derivatives: of the priors, and of the offsets.
+
+    Both are in units of the stated noise: where that is understated, they are larger than what is known says.
+    """
     residual, slope = outermost(_known_rows)(y, problem)
     return np.asarray(residual, dtype=np.float64), np.asarray(slope, dtype=np.float64)
 
@@ -111,10 +114,10 @@ def _known_rows(y: Coordinates, problem: Problem) -> tuple[Float[Array, " k"], F
 
     def of(y: Coordinates) -> Float[Array, " k"]:
         # An offset is 0 ± 1 in its unit, or its innovation is.
-        offsets = jnp.matmul(problem.batch.nuisances.innovation, y[size : problem.size], precision="highest")
-        if priors is None:
-            return offsets
-        return jnp.concatenate([priors.residuals(problem.parameters.atmosphere(y[:size])), offsets])
+        found = jnp.matmul(problem.batch.nuisances.innovation, y[size : problem.size], precision="highest")
+        if priors is not None:
+            found = jnp.concatenate([priors.residuals(problem.parameters.atmosphere(y[:size])), found])
+        return problem.understated * found
 
     return of(y), jax.jacfwd(of)(y)
 

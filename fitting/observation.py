@@ -34,6 +34,9 @@ NOISE = 0.01
 MAX_PIXELS = 20_000
 SUN_EXCLUSION = math.radians(2.0)
 
+NEGATIVE = 5.0
+"""Standard deviations of a dark pixel below zero down to which a pixel is dark, and not broken."""
+
 SUN_OFFSET_ERROR = math.radians(0.5)
 POSE_ERROR = math.radians(2.0)
 FOCAL_ERROR = 0.05
@@ -155,7 +158,8 @@ def observe(
             the middle one by wavelength, besides the exposure.
         pedestal: What is added to the light, in units of the image, as a black level that was not subtracted is: ``"fixed"`` at
             0, ``"free"`` (one number for this image), or the name of a group of images that share one; with ``-per-channel``
-            appended there is one for each channel. With a free one, negative pixels are used.
+            appended there is one for each channel. With a free one, all negative pixels are used; else those that
+            ``noise_floor`` explains.
         sun_offset: Whether the sun may be elsewhere than ``sun`` says: ``"fixed"``, ``"free"``, or the name of a group of
             images that share two small angles: the growth of the sun's zenith angle, and the way along its
             horizon circle, clockwise.
@@ -277,6 +281,7 @@ def observe(
         view_zenith_max=view_zenith_max,
         horizon_exclusion=horizon_exclusion,
         pedestal=pedestal,
+        noise_floor=_per_pixel(refuse, "noise_floor", 0.0 if noise_floor is None else noise_floor, image.shape),
     )
     masked = {reason: int(bad.sum()) for reason, bad in left_out.items()}
     none = np.zeros(image.shape[:2], dtype=bool)
@@ -380,6 +385,7 @@ def exclusions(
     view_zenith_max: float = math.pi / 2,
     horizon_exclusion: float = 0.0,
     pedestal: str = FIXED,
+    noise_floor: float | np.ndarray = 0.0,
 ) -> dict[str, Bool[np.ndarray, "height width"]]:
     """The pixels of an image that :func:`observe` leaves out, by reason, with its arguments; without empty ones.
 
@@ -394,7 +400,8 @@ def exclusions(
             _beyond(directions, view_zenith_max),
         ),
         ("not finite", ~np.all(np.isfinite(image), axis=-1)),
-        ("negative", np.any(image < 0, axis=-1) & (pedestal == FIXED)),
+        # Noise alone makes the darkest of pixels negative; without them the others would be too bright.
+        ("negative", np.any(image < -NEGATIVE * np.asarray(noise_floor), axis=-1) & (pedestal == FIXED)),
         ("black", np.all(image == 0, axis=-1)),
     ]
     if saturation is not None:

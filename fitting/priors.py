@@ -10,16 +10,21 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from diffatmo import constants, spectrum
-from diffatmo.atmosphere import SPECTRAL, Atmosphere
+from diffatmo.atmosphere import Atmosphere
+from diffatmo.compiling import outermost
 from diffatmo.numerics import array, safe_log
 from fitting._errors import FitError
-from fitting.parameters import Parameters
+from fitting.parameters import Coordinates, Parameters
 from fitting.quantities import DERIVED, REFERENCE_NM, Quantity, numbers, quantities, spectral_name
+
+ONE = 1e-4
+"""Second singular value, over the first, of the derivatives of numbers that vary as one: rounding."""
 
 SMALLEST, LARGEST = 1e-15, 1e15
 """Errors, and values, of which single precision holds the squares."""
@@ -30,8 +35,8 @@ class Prior:
     """``name`` is ``value`` ± ``error``.
 
     ``name`` is a number of the result (``rayleigh_optical_depth_550``), or a spectral field, which means each of its
-    wavelengths on its own; where a tie makes them one number, it is known once, at the wavelength nearest to 550 nm. With
-    ``relative``, ``error`` is one of the logarithm: 0.1 for 10 %, ln 2 for a factor of two.
+    wavelengths on its own; where they vary as one number, as by a tie, it is known once, at the wavelength nearest to 550 nm.
+    With ``relative``, ``error`` is one of the logarithm: 0.1 for 10 %, ln 2 for a factor of two.
     """
 
     name: str
@@ -86,9 +91,11 @@ def collect(priors: Sequence[Prior], parameters: Parameters) -> Priors | None:
             )
         if prior.relative and not prior.value > 0:
             raise FitError(f"prior: {prior}: a relative error needs a value > 0")
-        meant = [number for number, known_one in enumerate(known) if prior.name == known_one.name]
-        field = _once(prior.name, parameters) if any(prior.name == one.field for one in known) else prior.name
-        meant = meant[:1] or [number for number, one in enumerate(known) if field in (one.field, one.name)]
+        # The name of one number may be that of a field as well.
+        alone = any(prior.name == one.name for one in known) or not any(prior.name == one.field for one in known)
+        name = prior.name if alone else _once(prior.name, parameters)
+        meant = [number for number, one in enumerate(known) if one.name == name][:1]
+        meant = meant or [number for number, one in enumerate(known) if one.field == name]
         if not meant:
             names = ", ".join(dict.fromkeys(one.field for one in known))
             raise FitError(f"prior: {prior.name!r} does not vary in this fit; numbers that do are of {names}")
@@ -227,16 +234,20 @@ def _middle(parameters: Parameters) -> int:
 
 
 def _once(field: str, parameters: Parameters) -> str:
-    """A spectral ``field``; or its number nearest to 550 nm where a tie makes it one, so that it counts once."""
+    """A spectral ``field``; or its number nearest to 550 nm where all vary as one, so that it counts once."""
     if not _together(field, parameters):
         return field
     return spectral_name(field, float(parameters.init.wavelengths[_middle(parameters)]))
 
 
 def _together(field: str, parameters: Parameters) -> bool:
-    """Whether a tie makes the numbers of a spectral ``field`` one."""
-    if field == "mie_single_scattering_albedo":
-        return "mie_angstrom_exponent" in parameters.derived
-    own = "rayleigh_scattering" if field == "rayleigh_optical_depth" else field
-    spectral = own in SPECTRAL
-    return spectral and any(block.fields == (own,) and block.start.size == 1 for block in parameters.blocks)
+    """Whether the numbers of a ``field`` at several wavelengths vary as one: by a tie, or by something else they depend on."""
+    slopes = np.asarray(outermost(_slopes)(parameters.start, parameters, field), dtype=np.float64)
+    if len(slopes) < 2 or not np.isfinite(slopes).all():
+        return False
+    singular = np.linalg.svd(slopes, compute_uv=False)
+    return bool(singular[0] > 0 and np.all(singular[1:] < ONE * singular[0]))
+
+
+def _slopes(y: Coordinates, parameters: Parameters, field: str) -> Float[Array, "q n"]:
+    return jax.jacfwd(lambda y: numbers(parameters.atmosphere(y), (field,)))(y)

@@ -18,6 +18,7 @@ from jaxtyping import Array, Float, Int
 from diffatmo.atmosphere import Atmosphere
 from diffatmo.models import Model, Moments, Sky
 from diffatmo.models.base import View
+from diffatmo.numerics import array
 from fitting.batch import Batch, Views
 from fitting.correction import Correction
 from fitting.observation import sigma
@@ -36,7 +37,8 @@ class Problem(eqx.Module):
     ``weight`` is 1/sigma, and 0 for pixels that are not used; ``shell`` is what the model knows of the planet alone, if
     it makes use of that and the planet is not free. ``correction`` is what a finer model says over what this one says.
     ``loss`` is what outliers are given, if they are not given their squares, and ``fields`` are the forms that errors of the
-    model may have.
+    model may have. ``understated`` is the factor by which the residuals turned out larger than the stated noise: sigma is as
+    stated, and so what is known besides counts for so much more beside the images.
     """
 
     model: Model
@@ -48,6 +50,7 @@ class Problem(eqx.Module):
     priors: Priors | None = None
     loss: Loss | None = None
     fields: Fields | None = None
+    understated: Float[Array, ""] = eqx.field(default_factory=lambda: array(1.0))
 
     def sky(self, atmosphere: Atmosphere) -> Sky:
         """The sky of ``atmosphere``, by the model."""

@@ -71,8 +71,8 @@ class _Optimum(NamedTuple):
     y: Coordinates
     linearisation: Linearisation
     priors: list[Prior]
-    """With errors in units of the residuals, which the misfit makes larger."""
     scale: float
+    """Factor between the residuals and the stated noise."""
 
 
 class _Value(NamedTuple):
@@ -134,8 +134,8 @@ def _optimum(result: FitResult) -> _Optimum:
     problem, linearisation = restored(
         result.observations, parameters, y, priors=known, loss=setup.loss, model=model, refine=result.refine
     )
-    priors = [replace(prior, error=prior.error / result.error_scale) for prior in known]
-    return _Optimum(problem, y, linearisation, priors, result.error_scale)
+    problem = replace(problem, understated=array(result.error_scale, y.dtype))
+    return _Optimum(problem, y, linearisation, known, result.error_scale)
 
 
 def _number(y: Coordinates, priors: Priors, problem: Problem) -> Float[Array, ""]:
@@ -182,9 +182,9 @@ def _profile(
     name, error = estimate.name, estimate.standard_error
     alone = _alone(optimum, name)
     reach = REACH * error if error else max(abs(estimate.value), 1e-3)
-    tight = TIGHTNESS * (alone or reach / REACH) / optimum.scale
+    tight = TIGHTNESS * (alone or reach / REACH)
     # In single precision a number cannot be held more tightly than its own digits.
-    tight = max(tight, 1e-6 * abs(estimate.value))
+    tight = max(tight, 1e-6 * abs(estimate.value) * optimum.scale)
     unit = optimum.scale**2 * ((error / alone) ** 2 if error and alone else 1.0)
     problem = _held(optimum, name, estimate.value, tight)
     # The fit itself may end short of the optimum in directions that the images leave almost open.

@@ -87,6 +87,10 @@ HOPELESS_MISFIT = 1e4
 REWEIGHED, REWEIGHED_AT_MOST = 1.2, 5
 """Factor, in any image, between sigma and that of the light found, beyond which the fit goes on with that; how often."""
 
+BALANCED, BALANCED_AT_MOST = 1.1, 4
+"""Factor between the noise as the residuals show it and as it is taken to be, beyond which the fit goes on with the former, if
+anything is known besides the images; how often."""
+
 SETTLED = 0.9
 """Ratio of the scales of a robust loss, from one stage to the next, above which it does not fall any further."""
 
@@ -123,7 +127,7 @@ class Solution(NamedTuple):
     of_images: Factor
     """The triangular factor of the images alone."""
     of_priors: Float[np.ndarray, "k n"]
-    """The derivatives of the priors' residuals."""
+    """The derivatives of the residuals of what is known besides, in units of its own errors."""
     inflation: float | None
     """What a robust loss makes of the covariance (:meth:`fitting.robust.Loss.inflation`)."""
     outliers: list[int]
@@ -171,6 +175,8 @@ class _Run:
     seconds: list[float] = field(default_factory=list)
     final: bool = False
     """Whether sigma comes from the fitted signal."""
+    understated: float = 1.0
+    """Factor between the residuals and the noise, where that matters."""
     step_size: float | None = None
     """That of a search that was broken off, for the one that goes on; any other begins with its own."""
 
@@ -213,7 +219,9 @@ class _Run:
             return
         rows = [step._asdict() for step in self.history]
         try:
-            save(self.checkpoint, self.identity, Checkpoint(np.asarray(y), step_size, self.final, rows))
+            save(
+                self.checkpoint, self.identity, Checkpoint(np.asarray(y), step_size, self.final, self.understated, rows)
+            )
         except FitError as error:
             warnings.warn(f"{error}; the fit goes on without a checkpoint", stacklevel=2)
             self.checkpoint = None
@@ -309,6 +317,7 @@ def _final_pass(run: _Run, found: _Found) -> _Found:
         ]
         best, *rivals = _distinct([best, *others], problem)
     best, problem = _reweighed(run, best, problem, run.tolerance)
+    best, problem = _balanced(run, best, problem)
     return found._replace(best=best, rivals=rivals, problem=problem)
 
 
@@ -324,6 +333,30 @@ def _reweighed(run: _Run, best: Point, problem: Problem, tolerance: float) -> tu
         problem = other
         best = run.search(best.onward, problem, tolerance, fallback=best)
     return best, problem
+
+
+def _balanced(run: _Run, best: Point, problem: Problem) -> tuple[Point, Problem]:
+    """On from ``best`` while what is known besides is weighed against another noise than the residuals show.
+
+    Where the noise is understated the images would overrule what is known, and by more than the error bars admit.
+    """
+    for _ in range(BALANCED_AT_MOST if problem.known else 0):
+        found = _understated(best, problem)
+        if not best.converged or abs(math.log(found / float(problem.understated))) < math.log(BALANCED):
+            break
+        run.understated = found
+        problem = replace(problem, understated=array(found, best.y.dtype))
+        best = run.search(best.onward, problem, run.tolerance, fallback=best)
+    return best, problem
+
+
+def _understated(best: Point, problem: Problem) -> float:
+    """By what the error bars will be multiplied, as the residuals are so much larger than the stated noise."""
+    if problem.loss is not None:
+        off = outermost(whitened)(best.y, best.linearisation.radiance, problem)
+        return max(1.0, math.sqrt(problem.loss.inflation(off, problem.batch.used)))
+    chi2 = float(np.sum(reduce_images(best.y, best.linearisation, problem)[:, -1] ** 2))
+    return max(1.0, math.sqrt(chi2 / max(count(problem.batch) - best.y.size, 1)))
 
 
 def _noisier(a: Problem, b: Problem) -> float:
@@ -352,7 +385,8 @@ def _refined(run: _Run, found: _Found, finer: Model) -> tuple[_Found, Float[np.n
             problem = corrected(here, linearisation, alone, finer, near=near, evaluate=run.evaluate)
             assert problem.correction is not None
             slopes = slopes or (problem.correction, place)
-            best = run.search(on, problem, run.tolerance)
+            best, problem = _balanced(run, run.search(on, problem, run.tolerance), problem)
+            alone = replace(alone, understated=problem.understated)
             places.append(place)
             images.append(np.asarray(best.y, dtype=np.float64))
             metric = best.triangle[:, :-1]
@@ -392,7 +426,7 @@ def _shares(best: Point, problem: Problem) -> dict[str, Any]:
     }
     if problem.known:
         shares["of_images"] = reduce_images(best.y, best.linearisation, problem)
-        shares["of_priors"] = known_rows(best.y, problem)[1]
+        shares["of_priors"] = known_rows(best.y, problem)[1] / float(problem.understated)
     if problem.loss is not None:
         off = outermost(whitened)(best.y, best.linearisation.radiance, problem)
         shares["inflation"] = float(problem.loss.inflation(off, problem.batch.used))
@@ -469,13 +503,14 @@ def solve(
         y, start = run.begin(problem.start, problem)
     else:
         run.history += [Step(**row) for row in saved.history]
-        run.final, run.step_size = saved.final, saved.step_size
+        run.final, run.understated, run.step_size = saved.final, saved.understated, saved.step_size
         y = array(saved.y, problem.start.dtype)
         start = run.evaluate(*problem.split(y), problem)
     check_finite(np.asarray(start.bad), names, "at the start")
     if run.final:
-        problem = weighed(y, start.radiance, problem)
+        problem = replace(weighed(y, start.radiance, problem), understated=array(run.understated, y.dtype))
         best, problem = _reweighed(run, run.search(y, problem, tolerance), problem, tolerance)
+        best, problem = _balanced(run, best, problem)
         found = _Found(best, [], problem)
     else:
         found = _first_pass(run, y, start, problem, starts)

@@ -10,9 +10,6 @@ of their fields with their ``type``. A model that is not one of diffatmo's own i
 import dataclasses
 import json
 import math
-import tokenize
-import zipfile
-import zlib
 from collections.abc import Callable, Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -28,7 +25,7 @@ from diffatmo.camera import PROJECTIONS
 from diffatmo.models import MODELS, Model
 from diffatmo.phase import PhaseTable
 from diffatmo.scan import Scan
-from fitting._errors import FitError
+from fitting._errors import DAMAGED, FitError
 from fitting.findings import Estimate, Findings, Minimum, Profile, Setup
 from fitting.observation import Observation
 from fitting.priors import Prior
@@ -58,21 +55,6 @@ _CLASSES: dict[str, Callable[..., Any]] = {
     )
 }
 """What a result is made of, by the name that stands in the file."""
-
-_DAMAGED = (
-    ValueError,
-    TypeError,
-    LookupError,
-    AttributeError,
-    RuntimeError,
-    SyntaxError,
-    tokenize.TokenError,
-    EOFError,
-    MemoryError,
-    zipfile.BadZipFile,
-    zlib.error,
-)
-"""What NumPy, zip and JSON raise when a file is not what it seems."""
 
 
 def save(result: Findings, path: str | Path, *, overwrite: bool = False) -> None:
@@ -108,7 +90,7 @@ def load(path: str | Path, kind: type[F]) -> F:
         raise FitError(f"{path}: cannot be read: {error.strerror or error}") from error
     except FitError:
         raise
-    except _DAMAGED as error:
+    except DAMAGED as error:
         raise FitError(f"{path}: not a saved fit, or one that is damaged or cut short ({_line(error)})") from error
     try:
         record = json.loads(arrays[RECORD].tobytes())
@@ -118,7 +100,7 @@ def load(path: str | Path, kind: type[F]) -> F:
             by = f"diffatmo {record['version']}"
             raise ValueError(f"schema_version: got {record['schema_version']} ({by}), expected {SCHEMA_VERSION}")
         return kind(**{name: _unpack(value, arrays) for name, value in record["result"].items()})
-    except _DAMAGED as error:
+    except DAMAGED as error:
         raise FitError(f"{path}: not a fit as this version of diffatmo saves it: {_line(error)}") from error
 
 

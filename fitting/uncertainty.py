@@ -13,7 +13,8 @@ inverse, and every number that would move along it gets no standard error at all
 
 Standard errors are multiplied by √(reduced χ²) where that exceeds one, as the Particle Data Group does: if the
 residuals are larger than the stated noise, either the noise is understated or the model does not describe the image,
-and neither leaves room for more confidence.
+and neither leaves room for more confidence. What is known beforehand stays as it is, and so the fit has weighed the images
+against it with the noise that they show (:attr:`fitting.problem.Problem.understated`).
 """
 
 import math
@@ -119,7 +120,6 @@ def summarise(
     values, gradient = np.asarray(numbers_found, dtype=float), np.asarray(slopes, dtype=float)
     reduced_chi2 = solution.chi2 / max(solution.degrees_of_freedom, 1)
     scale = max(1.0, math.sqrt(reduced_chi2 if solution.inflation is None else solution.inflation))
-    # What is known beforehand stays as it is, however large the residuals of the images are.
     of_images = solution.of_images[:-1, :-1] / scale
     factor = np.asarray(np.linalg.qr(np.vstack([of_images, solution.of_priors]), mode="r"))
     covariance, determined = propagate(factor, gradient)

@@ -51,6 +51,17 @@ def test_pixels_are_masked_for_the_first_reason_that_applies():
     assert found.used.sum() == 16 * 64 - 8
 
 
+def test_a_pixel_that_noise_makes_negative_is_dark_and_not_broken():
+    """Left out, it would leave the bright ones: half of the pixels of a black image, whose mean would be 0.8 sigma."""
+    pixels = np.random.default_rng(0).standard_normal((32, 64, 3))
+    kept = observe(pixels, noise_floor=1.0)
+    assert "negative" not in kept.masked
+    # 3072 pixels: a standard deviation of 0.02.
+    assert kept.image[kept.used].mean() == pytest.approx(0, abs=0.08)
+    pixels[0, 0, 0] = -6
+    assert observe(pixels, noise_floor=1.0).masked["negative"] == 1
+
+
 def test_every_pixel_has_one_reason_or_is_used():
     """Also one that two reasons name, and one that is named twice."""
     pixels = np.ones((32, 64, 3))

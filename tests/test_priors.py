@@ -63,6 +63,26 @@ def test_large_residuals_do_not_loosen_a_prior():
     assert result.estimate("mie_scale_height").standard_error == pytest.approx(1e-3, rel=0.02)
 
 
+@pytest.mark.parametrize("loss", [None, "huber"])
+def test_understated_noise_does_not_overrule_what_is_known(loss):
+    """Noise stated ten times too small leads to the fit of the noise as it is, with its errors."""
+    of = toy_sky.truth()
+    known = [Prior("mie_scale_height", 1.17, 0.05), Prior("mie_g", 0.801, 0.001)]
+    honest, bold = (
+        fit(
+            toy_sky.observations(noise=0.03, stated=stated, sun_offset="free"),
+            init=of, free=FEW, model=Toy(), priors=known, loss=loss,
+        )
+        for stated in (0.03, 0.003)
+    )  # fmt: skip
+    assert bold.error_scale == pytest.approx(10 * honest.error_scale, rel=0.1)
+    assert honest.estimate("mie_scale_height").data_share == pytest.approx(0.5, abs=0.45)
+    for ours, theirs in zip(bold.estimates, honest.estimates, strict=True):
+        # Both searches end within a tenth of a standard error of the optimum.
+        assert ours.value == pytest.approx(theirs.value, abs=0.2 * theirs.standard_error), ours.name
+        assert ours.standard_error == pytest.approx(theirs.standard_error, rel=0.1), ours.name
+
+
 def test_a_spectral_prior_is_one_for_each_wavelength():
     parameters = select(toy_sky.truth(), FEW)
     known = priors.collect([Prior("rayleigh_optical_depth", 0.1, 0.01)], parameters)
@@ -102,6 +122,28 @@ def test_a_prior_on_a_tied_field_counts_once():
     assert priors.collect([Prior("mie_scattering", 4e-3, 1e-5)], select(earth(), ["mie_scattering"])).value.shape == (
         3,
     )
+
+
+@pytest.mark.parametrize(
+    ("field", "free", "tie"),
+    [
+        ("mie_optical_depth", ["mie_scattering"], {"mie_scattering": "start"}),
+        ("mie_single_scattering_albedo", ["mie_scattering"], {"mie_scattering": "start"}),
+        ("mie_single_scattering_albedo", ["mie_scattering", "mie_absorption"], {"mie": "angstrom"}),
+        ("mie_optical_depth", ["mie_scale_height"], {}),
+        ("rayleigh_optical_depth", ["rayleigh_scale_height"], {}),
+    ],
+)
+def test_what_varies_as_one_number_counts_once(field, free, tie):
+    assert priors.collect([Prior(field, 0.5, 0.1)], select(earth(), free, tie)).value.shape == (1,)
+
+
+def test_two_numbers_are_not_one():
+    """An amount and an exponent make three optical depths, of which each says something of its own."""
+    tied = select(earth(), ["mie_scattering"], {"mie": "angstrom"})
+    assert priors.collect([Prior("mie_optical_depth", 0.1, 0.01)], tied).value.shape == (3,)
+    air = select(earth(), ["rayleigh_scale_height"])
+    assert [prior.name for prior in priors.molecular(air)] == ["rayleigh_optical_depth_550", "rayleigh_scale_height"]
 
 
 def test_ozone_climatology():

@@ -64,7 +64,7 @@ ANGLES = (
 )
 """What :func:`fitting.observe` takes as it is, and what it takes in radians."""
 
-EXCLUDING = ("pedestal", "saturation", "sun_exclusion", "view_zenith_max", "horizon_exclusion")
+EXCLUDING = ("pedestal", "noise_floor", "saturation", "sun_exclusion", "view_zenith_max", "horizon_exclusion")
 """What of it says which pixels are left out."""
 
 MOST_SHOWN = 2048
