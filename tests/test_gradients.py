@@ -21,7 +21,7 @@ from diffatmo.models.raymarch import RayMarch
 # A derivative is a property of the code, not of the resolution: few nodes keep compilation and differences cheap.
 SMALL = Moments(
     altitudes=5, suns=9, first=Directions(4, 3, 3, 2, 4), iterate=Directions(3, 2, 3, 2, 2), last=Directions(3, 2, 4, 2, 3),
-    source_degree=3, peak_azimuths=6, order=3, view_steps=3, view_sky=9, view_ground=7, view_columns=5,
+    source_degree=3, peak_azimuths=6, order=4, view_steps=3, view_sky=9, view_ground=7, view_columns=5,
     view_fine_columns=9,
 )  # fmt: skip
 TABLES = Bruneton(sizes=Sizes(8, 16, 4, 8, 4, 8, 6, 4), steps=Steps(19, 5, 5, 4, 4), orders=3, quadrature="gauss")

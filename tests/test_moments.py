@@ -1,5 +1,6 @@
 """The default model against independent Monte Carlo, against itself at other resolutions, and at its limits."""
 
+from dataclasses import replace
 from functools import partial
 
 import equinox as eqx
@@ -23,7 +24,7 @@ def directions(zenith_deg, azimuth_deg):
 
 QUICK = Moments(
     altitudes=6, suns=10, first=Directions(4, 3, 3, 3, 4), iterate=Directions(3, 2, 3, 2, 2), last=Directions(3, 2, 4, 2, 3),
-    source_degree=3, peak_azimuths=6, order=3, view_steps=4, view_sky=9, view_ground=7, view_columns=5,
+    source_degree=3, peak_azimuths=6, order=4, view_steps=4, view_sky=9, view_ground=7, view_columns=5,
     view_fine_columns=9,
 )  # fmt: skip
 """Few nodes, for what does not depend on their number."""
@@ -110,6 +111,15 @@ def test_flux_is_conserved_by_a_conservative_atmosphere_over_white_ground(s1):
     down = directions(180 - np.degrees(np.arccos(mu)), 0 * mu)
     leaving = 2 * np.pi * (weight * mu) @ radiance(sky, 99.9, down, directions(0.0, 0.0)).radiance
     np.testing.assert_allclose(leaving, 1, atol=4e-3)
+
+
+@pytest.mark.parametrize(("albedo", "limit"), [(0.3, 2e-4), (1.0, 6e-3)])
+def test_orders_beyond_the_last_are_a_geometric_series(s1, albedo, limit):
+    """Against twice as many orders one by one; a white ground, which sends light up and down, is the hardest case."""
+    ground = eqx.tree_at(lambda a: a.ground_albedo, s1, jnp.full(3, albedo))
+    few, many = (solved(replace(QUICK, order=order), ground).state for order in (4, 9))
+    np.testing.assert_allclose(few.irradiance[:, -1], many.irradiance[:, -1], rtol=limit)
+    np.testing.assert_allclose(few.moments[0, 0, :, -1], many.moments[0, 0, :, -1], rtol=limit)
 
 
 def test_wavelengths_do_not_see_each_other(s1):
@@ -210,6 +220,11 @@ def test_thin_shells_and_far_observers_are_finite():
         assert bool((value >= 0).all()), place
         assert bool((value[1] > 0).all()), place
         assert all(bool(jnp.isfinite(slope).all()) for slope in slopes), place
+
+
+def test_a_series_needs_orders():
+    with pytest.raises(ValueError, match="order: got 3, expected at least 4"):
+        replace(QUICK, order=3)
 
 
 def test_rays_that_are_followed_together_have_as_many_steps():

@@ -47,7 +47,7 @@ class Moments(Model):
     last: Directions = Directions(sky=8, ground=5, azimuths=7, steps=5, degree=8)
     source_degree: int = 4
     peak_azimuths: int = 32
-    order: int = 5
+    order: int = 4
     view_steps: int = 10
     view_sky: int = 48
     view_ground: int = 20
@@ -55,6 +55,10 @@ class Moments(Model):
     view_fine_columns: int = 32
 
     def __check_init__(self) -> None:
+        if self.order < 4:
+            raise ValueError(
+                f"order: got {self.order}, expected at least 4, from which on the rest is a geometric series"
+            )
         if self.iterate.steps != self.last.steps:
             raise ValueError(
                 f"iterate and last: their rays are followed together, with {self.iterate.steps} and {self.last.steps} steps; "

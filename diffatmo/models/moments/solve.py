@@ -42,11 +42,15 @@ class State(NamedTuple):
     irradiance: Float[Array, "w j"]
 
 
-def _tail(last: Float[Array, "..."], previous: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Σ_{n>=1} (last / previous)^n, for the orders beyond the last one computed."""
+def _tail(last: Float[Array, "..."], before: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Σ_{n>=1} r^n with r² = last / before, two orders apart, for the orders beyond the last one computed.
+
+    Over a bright ground the ratio of one order to the next swings about its limit, as light goes down and up.
+    """
     # Squared by the derivative, what is smaller would overflow; such light is of no account.
-    counts = previous > tiny(previous.dtype)
-    ratio = jnp.clip(jnp.where(counts, last, 0) / jnp.where(counts, previous, 1), 0, 0.95)
+    counts = jnp.minimum(last, before) > tiny(before.dtype)
+    square = jnp.where(counts, last, 1) / jnp.where(counts, before, 1)
+    ratio = jnp.where(counts, jnp.minimum(jnp.sqrt(square), 0.95), 0)
     return ratio / (1 - ratio)
 
 
@@ -270,15 +274,15 @@ def solve(atmosphere: Atmosphere, shell: Shell, *, order: int, degrees_: Degrees
     transport, last = _Transport.build(atmosphere, shell, (low, degrees_.source), low)
     second = transport.apply(seed(low), None, low)
 
-    def next_order(carry: tuple[State, State, State], _: None) -> tuple[tuple[State, State, State], None]:
-        total, term, _previous = carry
+    def next_order(carry: tuple[State, State, State, State], _: None) -> tuple[tuple[State, State, State, State], None]:
+        total, term, previous, _before = carry
         following = transport.apply(None, term, low)
-        return (_add(total, following), following, term), None
+        return (_add(total, following), following, term, previous), None
 
-    (total, term, previous), _ = jax.lax.scan(next_order, (second, second, second), None, length=order - 2)
+    (total, term, _, before), _ = jax.lax.scan(next_order, (second, second, second, second), None, length=order - 2)
     # Geometric tail: far along the series each order is the one before times a ratio, here that of the mean radiance.
-    tail = _tail(term.moments[:, :1], previous.moments[:, :1])
-    ground_tail = _tail(term.irradiance, previous.irradiance)
+    tail = _tail(term.moments[:, :1], before.moments[:, :1])
+    ground_tail = _tail(term.irradiance, before.irradiance)
     total = _add(total, State(tail * term.moments, ground_tail * term.irradiance))
     beyond = last.apply(seed(degrees_.source), total, degrees_.last)
     kept = beyond.moments.shape[1]
