@@ -3,6 +3,7 @@
 :func:`write` puts into a directory
 
 - ``fit.json``, described below,
+- ``fit.npz``, from which ``FitResult.load`` has everything again, to predict with or to look at (:mod:`fitting.storage`),
 - ``atmosphere.toml``, the fitted atmosphere as every other command reads it,
 - ``fitted_<image>.exr`` and ``.png``, what the images should look like, and ``residual_<image>.exr`` and ``.png``,
   measured / fitted - 1,
@@ -66,6 +67,7 @@ from diffatmo.atmosphere import Atmosphere
 from diffatmo.bands import COLOURS
 from diffatmo.numerics import array
 from diffatmo.render import Scene
+from fitting import storage
 from fitting._errors import FitError
 from fitting.figures import (
     Image,
@@ -114,7 +116,7 @@ __all__ = [
 
 SCHEMA, SCHEMA_VERSION = "diffatmo-fit", 2
 
-FIXED_NAMES = ("fit.json", "atmosphere.toml", "report.html", "mask.png")
+FIXED_NAMES = ("fit.json", "fit.npz", "atmosphere.toml", "report.html", "mask.png")
 IMAGE_PREFIXES = ("fitted_", "residual_", "profile_", "mask_")
 
 
@@ -183,6 +185,7 @@ def write(
 
     tasks = {
         "fit.json": text(lambda: json.dumps(record(result), indent=1, allow_nan=False) + "\n"),
+        "fit.npz": lambda file: storage.save(result, file, overwrite=overwrite),
         "atmosphere.toml": text(lambda: atmosphere.dumps(result.atmosphere)),
     }
     for name, observation, fitted, residual in zip(

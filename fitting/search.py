@@ -77,7 +77,8 @@ class Step(NamedTuple):
     ``chi2`` is that of the point tried (infinite where the model was), ``accepted`` whether it became the current one;
     ``change`` is the largest change of a coordinate that led to it (about the relative change of a parameter),
     ``distance`` that from the current point to the optimum, in standard errors, ``damping`` the λ of
-    the next step, and ``stage`` counts the searches of the fit: the first has sigma from the measured signal.
+    the next step, and ``stage`` counts the searches of the fit, of which ``aim`` says in words what is new in them: χ² is not
+    the same from one to another.
     """
 
     step: int
@@ -89,6 +90,7 @@ class Step(NamedTuple):
     distance: float
     damping: float
     seconds: float
+    aim: str = ""
 
 
 Progress = Callable[[Step], Any]
@@ -176,12 +178,13 @@ def minimise(
     step_size: float | None = None,
     patience: int | None = None,
     fallback: Point | None = None,
+    aim: str = "",
 ) -> Point:
     """Levenberg-Marquardt from ``y`` until ``history`` holds ``max_steps``; ``start`` is the linearisation there, if known.
 
     ``keep`` is given the best point and the step size after every step; ``step_size`` is that of the first one.
     After ``patience`` steps a search that has still gone astray ends. Interrupted before its first point is known, it ends at
-    ``fallback``, if there is one.
+    ``fallback``, if there is one. ``aim`` is for the history.
     """
     begun = len(history)
     x, linear = problem.split(y)
@@ -237,6 +240,7 @@ def minimise(
                     distance=best.distance,
                     damping=scale / max(float(state.search_state.step_size), 1e-30),
                     seconds=time.perf_counter() - started,
+                    aim=aim,
                 )
             )
             keep(best.y, float(state.search_state.step_size))

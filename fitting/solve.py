@@ -94,6 +94,9 @@ anything is known besides the images; how often."""
 SETTLED = 0.9
 """Ratio of the scales of a robust loss, from one stage to the next, above which it does not fall any further."""
 
+OF_FITTED_LIGHT = "with the noise of the fitted light"
+"""Aim of a search."""
+
 UNLIKE = (
     "the images are not of such a sky: residuals are {:.0f} times the noise; are exposure, units, camera and sun right?"
 )
@@ -282,7 +285,8 @@ def _elsewhere(run: _Run, problem: Problem, rough: float, steps: int) -> Iterato
         x = array(np.append(point, np.zeros(problem.batch.nuisances.offsets)), dtype)
         y, start = run.begin(x, problem)
         if not np.asarray(start.bad).any():
-            yield run.search(y, problem, rough, aside=True, steps=last - len(run.history), start=start)
+            left = last - len(run.history)
+            yield run.search(y, problem, rough, aside=True, steps=left, start=start, aim="from another start")
 
 
 def _apart(a: Point, b: Point, problem: Problem) -> float:
@@ -309,11 +313,12 @@ def _final_pass(run: _Run, found: _Found) -> _Found:
     run.final = True
     before = found.best
     problem = weighed(before.y, before.linearisation.radiance, found.problem)
-    best = run.search(before.onward, problem, run.tolerance, fallback=before)
+    best = run.search(before.onward, problem, run.tolerance, fallback=before, aim=OF_FITTED_LIGHT)
     rivals = found.rivals
     if best.message != INTERRUPTED:
         others = [
-            run.search(other.onward, problem, run.tolerance, aside=True, fallback=other) for other in found.rivals
+            run.search(other.onward, problem, run.tolerance, aside=True, fallback=other, aim="the other minimum")
+            for other in found.rivals
         ]
         best, *rivals = _distinct([best, *others], problem)
     best, problem = _reweighed(run, best, problem, run.tolerance)
@@ -331,7 +336,7 @@ def _reweighed(run: _Run, best: Point, problem: Problem, tolerance: float) -> tu
             best = best._replace(converged=False, message=UNSETTLED)
             break
         problem = other
-        best = run.search(best.onward, problem, tolerance, fallback=best)
+        best = run.search(best.onward, problem, tolerance, fallback=best, aim=OF_FITTED_LIGHT)
     return best, problem
 
 
@@ -346,7 +351,7 @@ def _balanced(run: _Run, best: Point, problem: Problem) -> tuple[Point, Problem]
             break
         run.understated = found
         problem = replace(problem, understated=array(found, best.y.dtype))
-        best = run.search(best.onward, problem, run.tolerance, fallback=best)
+        best = run.search(best.onward, problem, run.tolerance, fallback=best, aim="what is known, beside such a noise")
     return best, problem
 
 
@@ -385,7 +390,8 @@ def _refined(run: _Run, found: _Found, finer: Model) -> tuple[_Found, Float[np.n
             problem = corrected(here, linearisation, alone, finer, near=near, evaluate=run.evaluate)
             assert problem.correction is not None
             slopes = slopes or (problem.correction, place)
-            best, problem = _balanced(run, run.search(on, problem, run.tolerance), problem)
+            best = run.search(on, problem, run.tolerance, aim="by the finer model")
+            best, problem = _balanced(run, best, problem)
             alone = replace(alone, understated=problem.understated)
             places.append(place)
             images.append(np.asarray(best.y, dtype=np.float64))
@@ -509,7 +515,7 @@ def solve(
     check_finite(np.asarray(start.bad), names, "at the start")
     if run.final:
         problem = replace(weighed(y, start.radiance, problem), understated=array(run.understated, y.dtype))
-        best, problem = _reweighed(run, run.search(y, problem, tolerance), problem, tolerance)
+        best, problem = _reweighed(run, run.search(y, problem, tolerance, aim=OF_FITTED_LIGHT), problem, tolerance)
         best, problem = _balanced(run, best, problem)
         found = _Found(best, [], problem)
     else:

@@ -70,7 +70,7 @@ def heights(noise, seed=3):
 
 def test_interval_is_asymmetric_where_the_number_enters_by_its_inverse():
     """The images are linear in u = 1/H, whose error is normal; so the interval of H, and its coverage, is that of u."""
-    result = profile(heights(noise=2.0), "mie_scale_height")
+    result = profile(heights(noise=3.0), "mie_scale_height")
     (found,) = result.profiles
     u = 1 / found.value
     sigma = u * found.standard_error / found.value
@@ -84,7 +84,7 @@ def test_interval_is_asymmetric_where_the_number_enters_by_its_inverse():
 
 
 def test_open_interval_is_said_to_be_open():
-    result = profile(heights(noise=3.5, seed=4), "mie_scale_height")
+    result = profile(heights(noise=5.3, seed=4), "mie_scale_height")
     (found,) = result.profiles
     low, high = found.interval(0.95)
     assert low is not None
@@ -94,7 +94,7 @@ def test_open_interval_is_said_to_be_open():
 
 def test_interval_ends_at_the_bound_of_the_range():
     dark = toy_sky.change(toy_sky.truth(), ground_albedo=1e-3)
-    (found,) = profile(linear(dark, noise=0.2), "ground_albedo_550").profiles
+    (found,) = profile(linear(dark, noise=0.2, seed=3), "ground_albedo_550").profiles
     assert found.value < 2 * found.standard_error
     assert found.bounded == (True, False)
     assert found.points[0] == 0
@@ -141,7 +141,6 @@ def test_profile_is_written_saved_and_shown(tmp_path):
     np.testing.assert_allclose(found["interval_68"], result.profiles[0].interval())
     assert (tmp_path / "profile_ground_albedo_550.png").read_bytes().startswith(b"\x89PNG")
     assert "Profile likelihood" in (tmp_path / "report.html").read_text()
-    result.save(tmp_path / "fit.npz")
     again = FitResult.load(tmp_path / "fit.npz").profiles[0]
     assert again.interval(0.95) == result.profiles[0].interval(0.95)
     assert result.plot("profiles").axes

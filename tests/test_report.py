@@ -37,7 +37,7 @@ def test_all_files_are_there(written):
     images = [
         f"{kind}_sun_{z}.{end}" for z in (30, 60, 80) for kind in ("fitted", "residual") for end in ("exr", "png")
     ]
-    expected = {"fit.json", "atmosphere.toml", "report.html", *images}
+    expected = {"fit.json", "fit.npz", "atmosphere.toml", "report.html", *images}
     assert {path.name for path in paths} == expected
     assert {path.name for path in directory.iterdir()} == expected
 
@@ -214,7 +214,7 @@ def test_of_a_scan_its_figure_is_written(tmp_path, monkeypatch):
     row = {name: getattr(seen, name)[8:9] for name in grids}
     scanned = dataclasses.replace(seen, name="scan", pose="free", **row)
     report.write(dataclasses.replace(found, observations=[scanned], fitted=[found.fitted[0][8:9]]), tmp_path)
-    pictures = {path.name for path in tmp_path.iterdir()} - {"fit.json", "atmosphere.toml", "report.html"}
+    pictures = {path.name for path in tmp_path.iterdir()} - set(report.FIXED_NAMES)
     assert pictures == {"fitted_scan.exr", "fitted_scan.png", "residual_scan.exr"}
     height, width, _ = imageio.read_image(tmp_path / "fitted_scan.png", transfer="srgb").pixels.shape
     assert width > 2 * height > 800

@@ -1,10 +1,12 @@
 """The ``diffatmo`` command: its subcommands, and how it ends.
 
 Exit status: 0 for success, 1 for a fit that did not converge (its best point is written all the same) or for images of many
-that could not be fitted, 2 for bad input, reported in one line on the standard error, 130 after Ctrl-C.
+that could not be fitted, 2 for bad input, reported in one line on the standard error, 130 after Ctrl-C or SIGTERM.
 """
 
+import signal
 import sys
+import threading
 from collections.abc import Sequence
 
 import click
@@ -50,6 +52,9 @@ diffatmo.add_command(plan)
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line ``arguments`` (those of the process by default) and return its exit status."""
+    # Schedulers end a run so: as after Ctrl-C, what was found so far is written.
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         status = diffatmo.main(args=arguments, prog_name="diffatmo", standalone_mode=False)
     except click.Abort:

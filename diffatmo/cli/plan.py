@@ -125,11 +125,17 @@ def plan(
         if value is not None
     }
     names = None if aims is None else [name.strip() for name in aims.split(",") if name.strip()]
+    begun = output.exists()
     folders.prepare(output, names=FILES, overwrite=overwrite)
     console = make_console()
     chosen = exposure or (job.observations[-1].exposure if job.observations else "fixed")
     with waiting(console, "compiling the model and its derivatives, then weighing the shots …"):
-        found = _find(job, at, names, shots, suns, chosen, given)
+        try:
+            found = _find(job, at, names, shots, suns, chosen, given)
+        except ValueError:
+            if not begun:
+                output.rmdir()
+            raise
     _write(output, found, chosen)
     console.print(_ranking(found, chosen))
     console.print(_sequence(found))

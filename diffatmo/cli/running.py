@@ -54,10 +54,13 @@ def run(job: Job, directory: Path, *, overwrite: bool, quiet: bool = False, writ
     history: list[Step] = []
 
     def show(step: "Step") -> None:
+        if step.aim and (not history or step.stage != history[-1].stage):
+            console.print(f"  {step.aim}:")
         history.append(step)
         mark = "" if step.accepted else "  (rejected)"
         left = steps_left(history, TOLERANCE)
-        told = left is not None and left <= job.max_steps - len(history)
+        # None are left in this search: there may be another.
+        told = left and left <= job.max_steps - len(history)
         time = f"  about {(left or 0) * step.seconds:.0f} s left" if told else ""
         console.print(f"  step {step.step:3}  reduced χ² {step.reduced_chi2:<10.5g}  {step.seconds:.2f} s{time}{mark}")
 
