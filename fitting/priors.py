@@ -5,6 +5,7 @@ fit as one more residual, (number - value) / error, and the result says for ever
 images' own. The named priors state what the field knows anyway, each with its source.
 """
 
+import difflib
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -98,7 +99,11 @@ def collect(priors: Sequence[Prior], parameters: Parameters) -> Priors | None:
         meant = meant or [number for number, one in enumerate(known) if one.field == name]
         if not meant:
             names = ", ".join(dict.fromkeys(one.field for one in known))
-            raise FitError(f"prior: {prior.name!r} does not vary in this fit; numbers that do are of {names}")
+            close = difflib.get_close_matches(
+                prior.name, [text for one in known for text in (one.field, one.name)], n=1
+            )
+            hint = f", did you mean {close[0]!r}?" if close else ";"
+            raise FitError(f"prior: {prior.name!r} does not vary in this fit{hint} numbers that do are of {names}")
         index += meant
         stated += [prior] * len(meant)
     dtype = parameters.start.dtype

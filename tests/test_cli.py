@@ -4,8 +4,10 @@ import csv
 import json
 import math
 import os
+import signal
 import subprocess
 import sys
+import threading
 from datetime import datetime
 from pathlib import Path
 
@@ -20,7 +22,7 @@ from diffatmo import atmosphere, imageio, models, scene, sun
 from diffatmo.camera import Equirectangular, Fisheye, Pinhole
 from diffatmo.cli import cache, images, shipped
 from diffatmo.cli import radiance as radiance_command
-from diffatmo.cli.common import InputError
+from diffatmo.cli.common import INTERRUPTED, InputError
 from diffatmo.cli.jobs import make_priors
 from diffatmo.cli.main import main
 from diffatmo.cli.render import picture_size
@@ -512,6 +514,16 @@ def test_priors_of_a_kind_are_those_of_what_is_free():
     assert of(["rayleigh_scale_height"]) == {"rayleigh_optical_depth_550", "rayleigh_scale_height"}
     with pytest.raises(InputError, match="'molecular' says nothing of what is free \\(mie_g\\)"):
         of(["mie_g"])
+
+
+def test_a_scheduler_ends_a_run_like_ctrl_c(monkeypatch):
+    assert threading.current_thread() is threading.main_thread()
+    before = signal.getsignal(signal.SIGTERM)
+    monkeypatch.setattr(cache, "enable", lambda: signal.raise_signal(signal.SIGTERM))
+    try:
+        assert main(["render", "--help"]) == INTERRUPTED
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def test_a_fault_of_ours_keeps_its_traceback(tmp_path, atm, monkeypatch):
