@@ -131,8 +131,8 @@ class Solution(NamedTuple):
     """The triangular factor of the images alone."""
     of_priors: Float[np.ndarray, "k n"]
     """The derivatives of the residuals of what is known besides, in units of its own errors."""
-    inflation: float | None
-    """What a robust loss makes of the covariance (:meth:`fitting.robust.Loss.inflation`)."""
+    error_scale: float
+    """By what the noise is understated, at least 1: √(reduced χ²), or what a robust loss makes of it."""
     outliers: list[int]
     """Pixels of each image to which a robust loss gives less than half their weight."""
     minima: list[tuple[Coordinates, float]]
@@ -359,7 +359,7 @@ def _understated(best: Point, problem: Problem) -> float:
     """By what the error bars will be multiplied, as the residuals are so much larger than the stated noise."""
     if problem.loss is not None:
         off = outermost(whitened)(best.y, best.linearisation.radiance, problem)
-        return max(1.0, math.sqrt(problem.loss.inflation(off, problem.batch.used)))
+        return max(1.0, math.sqrt(float(problem.loss.inflation(off, problem.batch.used))))
     chi2 = float(np.sum(reduce_images(best.y, best.linearisation, problem)[:, -1] ** 2))
     return max(1.0, math.sqrt(chi2 / max(count(problem.batch) - best.y.size, 1)))
 
@@ -427,7 +427,7 @@ def _shares(best: Point, problem: Problem) -> dict[str, Any]:
     shares: dict[str, Any] = {
         "of_images": best.triangle,
         "of_priors": np.zeros((0, best.y.size)),
-        "inflation": None,
+        "error_scale": _understated(best, problem),
         "outliers": [0] * problem.batch.used.shape[0],
     }
     if problem.known:
@@ -435,7 +435,6 @@ def _shares(best: Point, problem: Problem) -> dict[str, Any]:
         shares["of_priors"] = known_rows(best.y, problem)[1] / float(problem.understated)
     if problem.loss is not None:
         off = outermost(whitened)(best.y, best.linearisation.radiance, problem)
-        shares["inflation"] = float(problem.loss.inflation(off, problem.batch.used))
         weight = np.asarray(problem.loss(off)[0])
         shares["outliers"] = [int(n) for n in np.sum((weight < 0.5) & np.asarray(problem.batch.used), axis=1)]
     return shares

@@ -118,9 +118,7 @@ def summarise(
 
     slopes, (numbers_found, atmosphere) = outermost(_slopes)(solution.y, parameters, solution.batch.nuisances)
     values, gradient = np.asarray(numbers_found, dtype=float), np.asarray(slopes, dtype=float)
-    reduced_chi2 = solution.chi2 / max(solution.degrees_of_freedom, 1)
-    scale = max(1.0, math.sqrt(reduced_chi2 if solution.inflation is None else solution.inflation))
-    of_images = solution.of_images[:-1, :-1] / scale
+    of_images = solution.of_images[:-1, :-1] / solution.error_scale
     factor = np.asarray(np.linalg.qr(np.vstack([of_images, solution.of_priors]), mode="r"))
     covariance, determined = propagate(factor, gradient)
     shares = data_shares(of_images, factor, gradient)
@@ -168,7 +166,7 @@ def summarise(
         covariance_names=[estimate.name for estimate in [*estimates, *nuisances]],
         chi2=solution.chi2,
         degrees_of_freedom=solution.degrees_of_freedom,
-        error_scale=scale,
+        error_scale=solution.error_scale,
         iterations=len(solution.history),
         converged=solution.converged,
         message=solution.message,

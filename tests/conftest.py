@@ -35,12 +35,11 @@ def pytest_collection_modifyitems(items):
 
 @pytest.fixture(scope="session", autouse=True)
 def _keep_programs(tmp_path_factory):
-    """Programs that were dropped, those of the commands that tests start and of the other workers are found again on disk.
+    """Programs that were dropped, and those of the commands that tests start, are found again on disk.
 
-    A program that is read while another process writes it is compiled again.
+    Every worker has a folder of its own, as JAX does not guard its files against other processes.
     """
-    base = tmp_path_factory.getbasetemp()
-    folder = str((base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "programs")
+    folder = str(tmp_path_factory.mktemp("programs"))
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("JAX_COMPILATION_CACHE_DIR", folder)
         jax.config.update("jax_compilation_cache_dir", folder)
