@@ -30,8 +30,11 @@ from fitting.nuisances import (
 )
 from fitting.observation import FIXED, Observation
 
-PIXEL_FIELDS = ("directions", "measured", "used", "noise", "noise_shot", "noise_floor", "shading")
+PIXEL_FIELDS = ("directions", "measured", "used", "shading")
 """What a :class:`Batch` has for every pixel."""
+
+NOISE_FIELDS = ("noise", "noise_shot", "noise_floor")
+"""What a :class:`Batch` has for every pixel, unless it is the same in all of an image."""
 
 TILE = 8192
 """Pixels of a tile at most: their derivatives with respect to ten parameters take some hundred megabytes."""
@@ -58,9 +61,9 @@ class Batch(eqx.Module):
     """One direction for each pixel, or four that have the mean and the variance of those it is the mean of."""
     measured: Float[Array, "image pixel w"]
     used: Bool[Array, "image pixel"]
-    noise: Float[Array, "image pixel w"]
-    noise_shot: Float[Array, "image pixel w"]
-    noise_floor: Float[Array, "image pixel w"]
+    noise: Float[Array, "image #pixel w"]
+    noise_shot: Float[Array, "image #pixel w"]
+    noise_floor: Float[Array, "image #pixel w"]
     shading: Float[Array, "image pixel w s"]
     """Columns of the free coefficients of shading, in their order among the offsets."""
     exposure_value: Float[Array, " image"]
@@ -124,11 +127,17 @@ def stack(observations: Sequence[Observation], wavelengths: Sequence[float], mes
     size = devices * tiles * (rounded(each) if devices == 1 else each)
 
     def padded(field: str | Sequence[np.ndarray], fill: Any) -> Array:
-        rows = []
-        for index, observation in enumerate(observations):
-            value = (getattr(observation, field) if isinstance(field, str) else field[index])[observation.shown]
-            rows.append(np.concatenate([value, np.broadcast_to(fill, (size - len(value), *value.shape[1:]))]))
-        return number(np.stack(rows))
+        values = [getattr(o, field) for o in observations] if isinstance(field, str) else field
+        rows = np.full((len(observations), size, *values[0].shape[2:]), fill, values[0].dtype)
+        for row, value, observation in zip(rows, values, observations, strict=True):
+            row[: observation.shown.sum()] = value[observation.shown]
+        return number(rows)
+
+    def noise(field: str, fill: float) -> Array:
+        values = [getattr(observation, field) for observation in observations]
+        if all(np.all(value == value[:1, :1]) for value in values):
+            return number(np.stack([value[0, :1] for value in values]))
+        return padded(field, np.float32(fill))
 
     def number(value: Any) -> Array:
         value = np.asarray(value)
@@ -157,9 +166,9 @@ def stack(observations: Sequence[Observation], wavelengths: Sequence[float], mes
         # Pixels that are not finite are shown and counted but never used (fitting.observation); 0 * NaN would be NaN.
         measured=jnp.nan_to_num(padded("image", np.float32(0)), posinf=0.0, neginf=0.0),
         used=padded("used", False),
-        noise=padded("noise", np.float32(0)),
-        noise_shot=padded("noise_shot", np.float32(0)),
-        noise_floor=padded("noise_floor", np.float32(1)),
+        noise=noise("noise", 0.0),
+        noise_shot=noise("noise_shot", 0.0),
+        noise_floor=noise("noise_floor", 1.0),
         shading=padded(shaded, np.float32(0)),
         exposure_value=number([observation.exposure_value for observation in observations]),
         nuisances=nuisances,

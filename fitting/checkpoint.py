@@ -30,6 +30,12 @@ class Checkpoint(NamedTuple):
     """Whether sigma comes from the fitted signal already."""
     understated: float
     """Factor between the residuals and the noise, as far as the fit knows it."""
+    rivals: list[list[float]]
+    """Points near the other minima, if there are some."""
+    tried: int
+    """Other starts that were tried."""
+    given: float
+    """χ² of what the start that was given led to, if others were tried."""
     history: list[dict[str, Any]]
     """A row for each step."""
 

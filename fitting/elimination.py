@@ -124,6 +124,8 @@ def starting(radiance: np.ndarray, batch: Batch) -> Float[np.ndarray, " k"]:
 
     A robust loss needs a start at which most pixels are no outliers.
     """
+    if not batch.nuisances.linear:
+        return np.zeros(0)
     lit = radiance * np.asarray(batch.exposure_value)[:, None, None]
     ratio = np.asarray(batch.measured) / np.where(lit > 0, lit, np.inf)
     usable = np.asarray(batch.used)[..., None] & (ratio > 0) & np.isfinite(ratio)

@@ -23,7 +23,7 @@ from fitting.linearisation import Linearisation, linearise
 from fitting.observation import Observation, light_of
 from fitting.parameters import Coordinates, Parameters
 from fitting.priors import Prior, collect
-from fitting.problem import Linear, Predicted, Problem, light, planet_shell, weights, whitened
+from fitting.problem import Linear, Predicted, Problem, light, lit_weights, planet_shell, weights, whitened
 from fitting.robust import Loss, scale
 from fitting.smooth import Fields
 
@@ -61,7 +61,7 @@ def pose(
     signal, shell = batch.measured, eqx.filter_eval_shape(planet_shell, model, parameters)
     robust = None if loss is None else Loss(loss, jnp.ones((), signal.dtype))
     fields = Fields.of(batch, FIELD_DEGREE)
-    weight = outermost(weights)(batch, array(measured_light(batch), signal.dtype))
+    weight = outermost(weights)(batch, signal if not batch.nuisances.pedestals else array(measured_light(batch)))
     known = collect(priors, parameters)
     problem = Problem(model, parameters, batch, weight, shell, priors=known, loss=robust, fields=fields)
     if finer is None:
@@ -187,8 +187,7 @@ def _room(
 
 def weighed(y: Coordinates, radiance: Predicted, problem: Problem) -> Problem:
     """``problem`` with the weights of the signal expected at ``y``, and the scale of its loss that of the residuals there."""
-    lit = outermost(light)(y, radiance, problem)
-    return rescaled(y, radiance, replace(problem, weight=outermost(weights)(problem.batch, lit)))
+    return rescaled(y, radiance, replace(problem, weight=outermost(lit_weights)(y, radiance, problem)))
 
 
 def rescaled(y: Coordinates, radiance: Predicted, problem: Problem) -> Problem:

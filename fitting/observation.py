@@ -34,6 +34,9 @@ NOISE = 0.01
 MAX_PIXELS = 20_000
 SUN_EXCLUSION = math.radians(2.0)
 
+BAND = 500_000
+"""Pixels that are averaged at once, in about."""
+
 NEGATIVE = 5.0
 """Standard deviations of a dark pixel below zero down to which a pixel is dark, and not broken."""
 
@@ -297,7 +300,7 @@ def observe(
         "noise_shot": _per_pixel(refuse, "noise_shot", noise_shot, image.shape),
         "noise_floor": _per_pixel(refuse, "noise_floor", floor, image.shape),
     }
-    if np.any(sum(value[used] for value in noises.values()) == 0):
+    if np.any(np.all([value == 0 for value in noises.values()], axis=0) & used[..., None]):
         refuse("noise: it is zero for some pixels, expected a standard deviation > 0")
     block = math.ceil(math.sqrt(used.sum() / max_pixels))
     fields: dict[str, Any] = {"image": image, "directions": directions, "shown": shown, "used": used, **noises}
@@ -450,7 +453,18 @@ def light_of(pixels: Float[np.ndarray, "pixel w"], pedestal: str = FREE) -> Floa
 
 
 def _bin(fields: dict[str, np.ndarray], block: int, *, raised: bool) -> dict[str, np.ndarray]:
-    """Averages over ``block`` x ``block`` pixels; of used pixels where the block has any, else of those shown.
+    """Averages over ``block`` x ``block`` pixels, band after band of their rows: the memory is that of one."""
+    height, width = fields["used"].shape
+    rows = block * max(BAND // (block * width), 1)
+    bands = [
+        _bin_band({key: value[first : first + rows] for key, value in fields.items()}, block, raised)
+        for first in range(0, height, rows)
+    ]
+    return {key: np.concatenate([band[key] for band in bands]) for key in bands[0]}
+
+
+def _bin_band(fields: dict[str, np.ndarray], block: int, raised: bool) -> dict[str, np.ndarray]:
+    """Averages over blocks of used pixels where the block has any, else of those shown.
 
     ``raised`` by an unknown pedestal, the light in a pixel is not known, and taken to be the same in all of a block.
     """

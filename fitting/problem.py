@@ -153,6 +153,11 @@ def light(y: Coordinates, radiance: Predicted, problem: Problem) -> Predicted:
     return radiance * problem.batch.exposure(problem.split(y)[1])
 
 
+def lit_weights(y: Coordinates, radiance: Predicted, problem: Problem) -> Predicted:
+    """1/sigma of the light that is expected."""
+    return weights(problem.batch, light(y, radiance, problem))
+
+
 def expected(y: Coordinates, radiance: Predicted, problem: Problem) -> Predicted:
     """The light and the pedestal of every pixel."""
     return light(y, radiance, problem) + problem.batch.nuisances.pedestal(problem.split(y)[1])

@@ -35,10 +35,10 @@ class Fields(eqx.Module):
     def of(cls, batch: Batch, degree: int) -> Self:
         """Those up to ``degree``."""
         centres, coefficients = [], []
-        for directions, used in zip(batch.directions, batch.used, strict=True):
+        for directions, used in zip(np.asarray(batch.directions), np.asarray(batch.used), strict=True):
             own = np.flatnonzero(used)
             own = own[np.linspace(0, own.size - 1, min(own.size, SAMPLE)).astype(int)]
-            towards = np.asarray(directions)[own].astype(np.float64).mean(axis=1)
+            towards = directions[own].astype(np.float64).mean(axis=1)
             centre = towards.mean(axis=0)
             values = np.prod((towards - centre)[:, None] ** np.array(_monomials(degree), float), axis=-1)
             length = np.linalg.norm(values, axis=0)

@@ -151,6 +151,14 @@ class Solution(NamedTuple):
         return self.residual_count - self.y.size
 
 
+class _Others(NamedTuple):
+    """What other starts have led to: points near other minima, how many were tried, and χ² of what the given one led to."""
+
+    rivals: Sequence[Coordinates | list[float]] = ()
+    tried: int = 0
+    given: float = math.nan
+
+
 class _Found(NamedTuple):
     """The best point of a pass, other minima, and what the search from the given start led to if there were others."""
 
@@ -180,6 +188,7 @@ class _Run:
     """Whether sigma comes from the fitted signal."""
     understated: float = 1.0
     """Factor between the residuals and the noise, where that matters."""
+    others: _Others = field(default_factory=_Others)
     step_size: float | None = None
     """That of a search that was broken off, for the one that goes on; any other begins with its own."""
 
@@ -221,10 +230,10 @@ class _Run:
         if self.checkpoint is None or jax.process_index() > 0:
             return
         rows = [step._asdict() for step in self.history]
+        rivals = [np.asarray(other).tolist() for other in self.others.rivals]
+        state = (self.final, self.understated, rivals, self.others.tried, self.others.given, rows)
         try:
-            save(
-                self.checkpoint, self.identity, Checkpoint(np.asarray(y), step_size, self.final, self.understated, rows)
-            )
+            save(self.checkpoint, self.identity, Checkpoint(np.asarray(y), step_size, *state))
         except FitError as error:
             warnings.warn(f"{error}; the fit goes on without a checkpoint", stacklevel=2)
             self.checkpoint = None
@@ -308,22 +317,24 @@ def _distinct(points: Sequence[Point], problem: Problem) -> list[Point]:
     return kept
 
 
-def _final_pass(run: _Run, found: _Found) -> _Found:
-    """The optimum with sigma from the signal that ``found`` expects."""
+def _final_pass(run: _Run, y: Coordinates, problem: Problem, before: _Found | None = None) -> _Found:
+    """The optimum near ``y`` with sigma from the signal expected there, as ``problem`` has it, and the other minima.
+
+    What was found ``before`` is left if it is interrupted at once.
+    """
     run.final = True
-    before = found.best
-    problem = weighed(before.y, before.linearisation.radiance, found.problem)
-    best = run.search(before.onward, problem, run.tolerance, fallback=before, aim=OF_FITTED_LIGHT)
-    rivals = found.rivals
+    fallback, rivals = (None, []) if before is None else (before.best, before.rivals)
+    best = run.search(y, problem, run.tolerance, fallback=fallback, aim=OF_FITTED_LIGHT)
     if best.message != INTERRUPTED:
+        points = [array(other, y.dtype) for other in run.others.rivals]
         others = [
-            run.search(other.onward, problem, run.tolerance, aside=True, fallback=other, aim="the other minimum")
-            for other in found.rivals
+            run.search(point, problem, run.tolerance, aside=True, fallback=best, aim="the other minimum")
+            for point in points
         ]
         best, *rivals = _distinct([best, *others], problem)
     best, problem = _reweighed(run, best, problem, run.tolerance)
     best, problem = _balanced(run, best, problem)
-    return found._replace(best=best, rivals=rivals, problem=problem)
+    return _Found(best, rivals, problem, run.others.tried, run.others.given)
 
 
 def _reweighed(run: _Run, best: Point, problem: Problem, tolerance: float) -> tuple[Point, Problem]:
@@ -367,9 +378,11 @@ def _understated(best: Point, problem: Problem) -> float:
 def _noisier(a: Problem, b: Problem) -> float:
     """The typical factor, in the image where it is largest, by which sigma differs between ``a`` and ``b``."""
     used = np.asarray(a.batch.used)
-    logs = [np.log(np.maximum(np.asarray(problem.weight, dtype=np.float64), 1e-300)) for problem in (a, b)]
-    off = np.where(used[..., None], np.abs(logs[0] - logs[1]), 0).mean(axis=-1)
-    return float(np.exp(np.max(off.sum(axis=1) / used.sum(axis=1))))
+    one, other = (np.asarray(problem.weight) for problem in (a, b))
+    least = np.finfo(one.dtype).tiny
+    off = np.log(np.maximum(one, least)) - np.log(np.maximum(other, least))
+    of_pixels = np.abs(off, out=off).mean(axis=-1)
+    return float(np.exp(max(np.mean(pixels[among]) for pixels, among in zip(of_pixels, used, strict=True))))
 
 
 def _refined(run: _Run, found: _Found, finer: Model) -> tuple[_Found, Float[np.ndarray, "n n"]]:
@@ -509,18 +522,22 @@ def solve(
     else:
         run.history += [Step(**row) for row in saved.history]
         run.final, run.understated, run.step_size = saved.final, saved.understated, saved.step_size
+        run.others = _Others(saved.rivals, saved.tried, saved.given)
         y = array(saved.y, problem.start.dtype)
         start = run.evaluate(*problem.split(y), problem)
     check_finite(np.asarray(start.bad), names, "at the start")
     if run.final:
         problem = replace(weighed(y, start.radiance, problem), understated=array(run.understated, y.dtype))
-        best, problem = _reweighed(run, run.search(y, problem, tolerance, aim=OF_FITTED_LIGHT), problem, tolerance)
-        best, problem = _balanced(run, best, problem)
-        found = _Found(best, [], problem)
+        found = _final_pass(run, y, problem)
     else:
         found = _first_pass(run, y, start, problem, starts)
+        # As large as the images are, and of no use any more.
+        del start
         if not found.interrupted:
-            found = _final_pass(run, found)
+            run.others = _Others([rival.onward for rival in found.rivals], found.tried, found.given)
+            best = found.best
+            problem = weighed(best.y, best.linearisation.radiance, found.problem)
+            found = _final_pass(run, best.onward, problem, found)
     minima = [(point.y, point.chi2) for point in (found.best, *found.rivals)] if found.rivals else []
     error, alone = np.zeros((size, size)), found.best
     if finer is not None and found.best.converged:

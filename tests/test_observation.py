@@ -9,7 +9,7 @@ import pytest
 import fitting
 from diffatmo import sun
 from diffatmo.camera import Equirectangular, Fisheye
-from fitting import FitError
+from fitting import FitError, observation
 from fitting.batch import stack
 from fitting.nuisances import gather
 from fitting.observation import exclusions, sigma, unstack
@@ -203,6 +203,33 @@ def test_sizes_that_the_blocks_do_not_divide():
     found = observe(np.ones((15, 31, 3)), camera=camera, max_pixels=60)
     assert found.image.shape == (5, 11, 3)
     np.testing.assert_allclose(found.image, 1, rtol=1e-6)
+
+
+def test_bands_of_rows_make_no_difference(monkeypatch):
+    random = np.random.default_rng(2)
+    camera = Equirectangular(31, 62)
+    pixels = random.uniform(1, 2, (31, 62, 3))
+    options = {"camera": camera, "max_pixels": 60, "noise": random.uniform(0.01, 0.02, (31, 62)), "noise_shot": 1e-3}
+    whole = observe(pixels, **options)
+    monkeypatch.setattr(observation, "BAND", 100)
+    banded = observe(pixels, **options)
+    assert whole.block > 1
+    for name in ("image", "directions", "radius", "spread", "shown", "used", "noise", "noise_shot", "noise_floor"):
+        np.testing.assert_array_equal(getattr(banded, name), getattr(whole, name))
+
+
+@pytest.mark.parametrize(("pixel", "kept"), [(0.0, 1), (0.01, 2048)])
+def test_noise_that_is_the_same_everywhere_is_kept_once(pixel, kept):
+    """And means the same as that of every pixel: a hundred megabytes of ten megapixels, for each kind of it."""
+    each = np.full((32, 64), 0.02)
+    each[3, 5] += pixel
+    batch = stack([observe(noise=each), observe(noise=0.03, name="other")], NM)
+    assert batch.noise.shape == (2, kept, 3)
+    assert batch.noise_floor.shape == (2, 1, 3)
+    expected = [np.asarray(sigma(o, o.image))[o.shown] for o in (observe(noise=each), observe(noise=0.03))]
+    found = np.asarray(sigma(batch, batch.measured))
+    for image in range(2):
+        np.testing.assert_allclose(found[image, : len(expected[image])], expected[image], rtol=1e-6)
 
 
 def test_stack_pads_and_unstack_restores():

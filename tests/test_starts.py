@@ -11,6 +11,7 @@ from fitting import FitError, FitResult, fit, report
 from fitting.batch import stack
 from fitting.parameters import select
 from fitting.problem import Problem
+from fitting.solve import OF_FITTED_LIGHT
 from fitting.starts import grid, ranked, separation, thinned
 from fitting.tables import notes
 
@@ -112,10 +113,11 @@ def test_a_fit_that_does_not_go_astray_costs_nothing_more():
     assert [step.chi2 for step in found.history] == [step.chi2 for step in toy_sky.result().history]
 
 
-def twins(tilt, starts):
+def twins(tilt, starts, **options):
     model = Twin(tilt)
     seen = observation(model, toy_sky.change(truth(), mie_g=0.5))
-    return fit([seen], init=toy_sky.change(truth(), mie_g=0.2), free=["mie_g"], model=model, starts=starts)
+    init = toy_sky.change(truth(), mie_g=0.2)
+    return fit([seen], init=init, free=["mie_g"], model=model, starts=starts, **options)
 
 
 def test_two_minima_are_reported(tmp_path):
@@ -130,6 +132,24 @@ def test_two_minima_are_reported(tmp_path):
     assert report.record(found)["minima"][1]["values"]["mie_g"] == found.minima[1].values["mie_g"]
     found.save(tmp_path / "fit.npz")
     assert FitResult.load(tmp_path / "fit.npz").minima == found.minima
+
+
+@pytest.mark.parametrize("aim", [OF_FITTED_LIGHT, "the other minimum"])
+def test_a_fit_killed_in_its_last_pass_still_knows_its_other_minimum(aim, tmp_path):
+    class Killed(Exception):
+        pass
+
+    def kill(step):
+        if step.aim == aim:
+            raise Killed
+
+    with pytest.raises(Killed):
+        twins(0.0, starts=3, checkpoint=tmp_path / "checkpoint.npz", progress=kill)
+    seen = []
+    found = twins(0.0, starts=3, checkpoint=tmp_path / "checkpoint.npz", progress=seen.append)
+    assert found.converged
+    assert len(seen) < 5
+    assert sorted(minimum.values["mie_g"] for minimum in found.minima) == pytest.approx([-0.5, 0.5], abs=0.01)
 
 
 def test_one_minimum_found_twice_is_one():

@@ -1,11 +1,12 @@
 """What a fit costs, in seconds and in memory, against pixels, parameters and images.
 
-python tests/benchmarks/cost.py [--plot cost.png] [--largest 1e7] [--only pixels|numbers|images]
+python tests/benchmarks/cost.py [--plot cost.png] [--largest 1e7] [--only pixels|averaged|numbers|images]
 
 Every case is a process of its own, and a fit that is broken off after three steps: what a step costs does not change any more.
-No pixels are averaged. Memory is the largest the process ever held: before the fit, with the images read, checked and in
-memory, and after. What the compiler needs is the same however many pixels there are. The pictures are made by the
-default model, in processes of their own, and kept in a folder of the system's temporary files.
+No pixels are averaged but in the series of that name, where the default decides how many. Memory is the largest the process
+ever held: before the fit, with the images read, checked and in memory, and after. What the compiler needs is the same however
+many pixels there are. The pictures are made by the default model, in processes of their own, and kept in a folder of the
+system's temporary files.
 """
 
 import argparse
@@ -42,7 +43,8 @@ FREE = {3: ORDER[:3], 6: ORDER[:4], 9: ORDER[:5], 12: ORDER[:6], 20: ORDER}
 """Free fields by the number of their numbers at three wavelengths."""
 PIXELS = (1e3, 1e4, 1e5, 1e6, 1e7)
 IMAGES = (1, 4, 16, 64)
-USUAL = {"pixels": 10_000, "numbers": 9, "images": 1}
+USUAL = {"pixels": 10_000, "numbers": 9, "images": 1, "averaged": 0}
+SERIES = ("pixels", "averaged", "numbers", "images")
 SMALL = 2_000
 """Pixels of each of many images."""
 
@@ -77,8 +79,9 @@ def largest() -> int:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 
 
-def measure(pixels: int, numbers: int, images: int) -> dict[str, float]:
+def measure(pixels: int, numbers: int, images: int, averaged: int) -> dict[str, float]:
     """Fit, in a process that does nothing else."""
+    limit = {} if averaged else {"max_pixels": 2 * pixels}
     observations = [
         fitting.observe(
             np.load(picture(pixels, zenith)),
@@ -86,8 +89,8 @@ def measure(pixels: int, numbers: int, images: int) -> dict[str, float]:
             altitude=ALTITUDE_KM,
             sun=sun.direction(zenith=zenith, azimuth=0.5),
             noise=NOISE,
-            max_pixels=2 * pixels,
             name=str(number),
+            **limit,
         )
         for number, zenith in enumerate(zeniths(images))
     ]
@@ -100,7 +103,7 @@ def measure(pixels: int, numbers: int, images: int) -> dict[str, float]:
     # The first of the steps stands on what was computed before it.
     return {
         "pixels": sum(int(observation.used.sum()) for observation in observations),
-        "input": sum(observation.image.nbytes for observation in observations),
+        "input": sum(12 * camera(pixels).height * camera(pixels).width for _ in observations),
         "before": before,
         "after": largest(),
         "step": float(np.median([step.seconds for step in result.history[1:]])),
@@ -119,14 +122,16 @@ def alone(*arguments: str) -> str:
     ]
 
 
-def series(largest_picture: float) -> dict[str, list[dict[str, int]]]:
+def series(largest_picture: float) -> dict[str, list[tuple[int, dict[str, int]]]]:
     """The cases, by what changes."""
-    usual = dict(USUAL)
-    return {
-        "pixels": [usual | {"pixels": int(n)} for n in PIXELS if n <= largest_picture],
-        "numbers": [usual | {"numbers": n} for n in FREE],
-        "images": [usual | {"pixels": SMALL, "images": n} for n in IMAGES],
+    pixels = [int(n) for n in PIXELS if n <= largest_picture]
+    of: dict[str, list[tuple[int, dict[str, int]]]] = {
+        "pixels": [(n, {"pixels": n}) for n in pixels],
+        "averaged": [(n, {"pixels": n, "averaged": 1}) for n in pixels],
+        "numbers": [(n, {"numbers": n}) for n in FREE],
+        "images": [(n, {"pixels": SMALL, "images": n}) for n in IMAGES],
     }
+    return {name: [(n, USUAL | own) for n, own in cases] for name, cases in of.items()}
 
 
 def plot(found: dict[str, list[tuple[int, dict[str, float]]]], file: Path) -> None:
@@ -146,7 +151,7 @@ def plot(found: dict[str, list[tuple[int, dict[str, float]]]], file: Path) -> No
         below.loglog(x, [case["after"] / 1e9 for _, case in cases], "o-", label="largest")
         below.loglog(x, [case["before"] / 1e9 for _, case in cases], "s:", label="before the fit")
         below.loglog(x, [case["input"] / 1e9 for _, case in cases], "^:", label="images alone")
-        below.set_xlabel(name)
+        below.set_xlabel("pixels, averaged to 20 000" if name == "averaged" else name)
         below.set_xticks(x, [f"{number:g}" for number in x])
         below.minorticks_off()
     axes[0, 0].set_ylabel("s")
@@ -161,8 +166,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--plot", type=Path, help="a file for the figure")
     parser.add_argument("--largest", type=float, default=max(PIXELS), help="pixels of the largest picture")
-    parser.add_argument("--only", choices=list(USUAL), help="one of the three series")
-    parser.add_argument("--case", nargs=3, type=int, help=argparse.SUPPRESS)
+    parser.add_argument("--only", choices=SERIES, help="one of the series")
+    parser.add_argument("--case", nargs=4, type=int, help=argparse.SUPPRESS)
     parser.add_argument("--pictures", nargs="+", type=float, help=argparse.SUPPRESS)
     asked = parser.parse_args()
     if asked.pictures:
@@ -181,16 +186,16 @@ def main() -> None:
             "images, GB", "the fit adds, bytes per pixel", title=f"{processor()}, jax {jax.__version__}",
         )  # fmt: skip
         found[name] = []
-        for case in cases:
+        for number, case in cases:
             alone("--pictures", str(case["pixels"]), *(repr(float(zenith)) for zenith in zeniths(case["images"])))
             cost = json.loads(alone("--case", *(str(case[key]) for key in USUAL)))
-            found[name].append((case[name], cost))
+            found[name].append((number, cost))
             print(name, case, {key: float(f"{value:.4g}") for key, value in cost.items()}, flush=True)
             # What the fit of a small picture adds is the compiler's.
             added, floor = (c["after"] - c["before"] for c in (cost, found[name][0][1]))
-            more = cost["pixels"] - found[name][0][1]["pixels"]
+            more = (cost["input"] - found[name][0][1]["input"]) / 12
             table.add_row(
-                f"{case[name]:g}",
+                f"{number:g}",
                 f"{cost['step']:.3g}",
                 f"{cost['compile']:.0f}",
                 f"{cost['total']:.0f}",
