@@ -4,6 +4,7 @@ import csv
 import json
 import math
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -11,6 +12,7 @@ import threading
 from datetime import datetime
 from pathlib import Path
 
+import click
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -265,7 +267,8 @@ def test_fit_goes_on_where_it_was_broken_off(tmp_path, s1, start, toy, capfd, mo
     command = ["fit", image, "--init", start, *TOY_FREE, "-o", str(out)]
     with monkeypatch.context() as patch:
         patch.setattr(report, "write", lambda *_, **__: (_ for _ in ()).throw(OSError("No space left on device")))
-        assert main(command) != 0
+        assert main([*command, "--resume"]) != 0
+    assert "no fit was broken off here" in capfd.readouterr().out
     kept = (out / checkpoint.FILE).read_bytes()
     capfd.readouterr()
     assert main(command) == 2
@@ -550,6 +553,24 @@ def test_compiled_programs_are_kept_where_the_user_keeps_caches(tmp_path, monkey
     cache.enable()
     found = os.environ.get(cache.VARIABLE)
     assert found == (str(tmp_path / expected) if expected == "here/diffatmo" else expected)
+
+
+def test_help_has_every_option_under_a_heading(capsys):
+    """Those of the camera under that of the camera, and so on; a heading that no option begins would be lost."""
+    from diffatmo.cli.fit import HEADINGS, fit
+
+    assert main(["fit", "--help"]) == 0
+    shown = capsys.readouterr().out
+    assert {option.name for option in fit.params} >= set(HEADINGS)
+    parts = re.split(r"^(\S.*):$", shown, flags=re.MULTILINE)
+    under = dict(zip(parts[1::2], parts[2::2], strict=True))
+    assert [*under] == [*HEADINGS.values()]
+    assert "--fov-deg" in under["Camera"]
+    assert "--sun-zenith-deg" in under["Place and sun"]
+    assert "--pose-error-deg" in under["What may be off"]
+    for option in fit.params:
+        if isinstance(option, click.Option):
+            assert sum(option.opts[0] in text for text in under.values()) >= 1
 
 
 def test_help_and_version(capsys):

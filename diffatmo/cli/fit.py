@@ -7,13 +7,24 @@ from typing import Any
 import click
 
 from diffatmo.cli import keys, many, shipped
-from diffatmo.cli.common import INTERRUPTED, InputError, overwrite_option
+from diffatmo.cli.common import INTERRUPTED, InputError, make_console, overwrite_option
 from diffatmo.cli.jobs import prepare
 from diffatmo.cli.running import run, run_quietly
 from diffatmo.cli.scenefile import FREE, IMAGE_KEYS, LOSSES, MODELS, FitSpec, bracket, check_image_options, read_scene
 
+HEADINGS = {
+    "config": "What is fitted, and how",
+    "projection": "Camera",
+    "altitude_km": "Place and sun",
+    "exposure": "What may be off",
+    "noise": "Noise, and pixels to leave out",
+    "transfer": "Photos and brackets",
+    "bracketed": "The run",
+}
+"""Of the help, by the first option under each."""
 
-@click.command()
+
+@click.command(cls=keys.Headed, headings=HEADINGS)
 @click.argument("images", metavar="[IMAGE|FOLDER]...", nargs=-1, type=click.Path(path_type=Path))
 @click.option(
     "--config",
@@ -165,6 +176,10 @@ def fit(
                 (directory / checkpoint.FILE).unlink(missing_ok=True)
     statuses: list[int] = []
     for directory, job in jobs.items():
+        if resume and first and not begun[directory]:
+            make_console().print(
+                f"{directory}: no fit was broken off here; this one begins at its start", soft_wrap=True
+            )
         statuses.append(run(job, directory, overwrite=overwrite or begun[directory], quiet=not first, write=first))
         if statuses[-1] == INTERRUPTED:
             break

@@ -173,6 +173,27 @@ def options(keys: Mapping[str, Key], shown: Mapping[str, Any] | None = None) -> 
     return decorate
 
 
+class Headed(click.Command):
+    """A command with so many options that its help lists them under headings, each above the option it is given for."""
+
+    def __init__(self, *args: Any, headings: Mapping[str, str], **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        self.headings = headings
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the options of the help."""
+        rows: dict[str, list[tuple[str, str]]] = {}
+        heading = "Options"
+        for option in self.get_params(ctx):
+            heading = self.headings.get(option.name or "", heading)
+            record = option.get_help_record(ctx)
+            if record is not None and not isinstance(option, click.Argument):
+                rows.setdefault(heading, []).append(record)
+        for heading, own in rows.items():
+            with formatter.section(heading):
+                formatter.write_dl(own)
+
+
 def flag_of(name: str) -> str:
     """The option of a key."""
     return f"--{name.replace('_', '-')}"

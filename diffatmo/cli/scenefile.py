@@ -63,9 +63,9 @@ IMAGE_KEYS: dict[str, Key] = {
     "tone": Word(
         "Pixels may have been through another tone curve: fixed, free, or the name of a group.  [default: fixed]"
     ),
+    "tone_error": Number("Standard deviation of its three coefficients.  [default: 0.15]", 0, 1, positive=True),
     "chroma": Word("Colours may be purer or paler: fixed, free, or the name of a group.  [default: fixed]"),
     "chroma_error": Number("Standard deviation of its coefficient.  [default: 0.2]", 0, 1, positive=True),
-    "tone_error": Number("Standard deviation of its three coefficients.  [default: 0.15]", 0, 1, positive=True),
     "aerosol": Word(
         "There may be more or less aerosol than the atmosphere's: fixed, free, or the name of a group.  [default: fixed]"
     ),
