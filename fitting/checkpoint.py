@@ -26,6 +26,8 @@ class Checkpoint(NamedTuple):
     """The best point of the present stage."""
     step_size: float
     """Inverse of the damping of the next step."""
+    max_steps: int
+    """How many steps there may be, with those that other starts have taken."""
     final: bool
     """Whether sigma comes from the fitted signal already."""
     understated: float
@@ -67,11 +69,14 @@ def load(path: Path, fit: str) -> Checkpoint | None:
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             y, record = archive["y"], json.loads(archive["record"].tobytes())
-        owner, checkpoint = record.pop("fit"), Checkpoint(y, **record)
+        owner = record.pop("fit")
+        checkpoint = Checkpoint(y, **record) if {"y", *record} == {*Checkpoint._fields} else None
     except OSError as error:
         raise FitError(f"{path}: cannot be read: {error.strerror or error}") from error
     except DAMAGED as error:
         raise FitError(f"{path}: not a checkpoint of a fit; remove it to start anew") from error
     if owner != fit:
         raise FitError(f"{path}: belongs to a fit of other images or options; remove it to start anew")
+    if checkpoint is None:
+        raise FitError(f"{path}: written by another version of diffatmo; remove it to start anew")
     return checkpoint

@@ -233,6 +233,8 @@ def observe(
     refuse.unless(saturation is None or saturation > 0, "saturation", saturation, "a number > 0")
     refuse.unless(max_pixels >= 1, "max_pixels", max_pixels, "at least 1")
     for key, value in (("exposure", exposure), ("pedestal", pedestal)):
+        known = ", a number that is known is exposure_value" if key == "exposure" else ""
+        refuse.unless(isinstance(value, str), key, repr(value), f'"fixed", "free" or a name{known}')
         named = value.removesuffix(PER_CHANNEL) and value != FIXED + PER_CHANNEL
         refuse.unless(bool(named), key, repr(value), '"fixed", "free" or a name')
     for key, value in (

@@ -231,7 +231,7 @@ class _Run:
             return
         rows = [step._asdict() for step in self.history]
         rivals = [np.asarray(other).tolist() for other in self.others.rivals]
-        state = (self.final, self.understated, rivals, self.others.tried, self.others.given, rows)
+        state = (self.max_steps, self.final, self.understated, rivals, self.others.tried, self.others.given, rows)
         try:
             save(self.checkpoint, self.identity, Checkpoint(np.asarray(y), step_size, *state))
         except FitError as error:
@@ -326,15 +326,26 @@ def _final_pass(run: _Run, y: Coordinates, problem: Problem, before: _Found | No
     fallback, rivals = (None, []) if before is None else (before.best, before.rivals)
     best = run.search(y, problem, run.tolerance, fallback=fallback, aim=OF_FITTED_LIGHT)
     if best.message != INTERRUPTED:
-        points = [array(other, y.dtype) for other in run.others.rivals]
-        others = [
-            run.search(point, problem, run.tolerance, aside=True, fallback=best, aim="the other minimum")
-            for point in points
-        ]
-        best, *rivals = _distinct([best, *others], problem)
+        best, rivals = _among_others(run, best, problem)
+    alone = problem
     best, problem = _reweighed(run, best, problem, run.tolerance)
     best, problem = _balanced(run, best, problem)
+    if problem is not alone and best.message != INTERRUPTED:
+        # Minima compare by the same noise.
+        best, rivals = _among_others(run, best, problem)
     return _Found(best, rivals, problem, run.others.tried, run.others.given)
+
+
+def _among_others(run: _Run, best: Point, problem: Problem) -> tuple[Point, list[Point]]:
+    """The best of ``best`` and of the minima near those of ``run.others``, and its rivals, which are those from there on."""
+    points = [array(other, best.y.dtype) for other in run.others.rivals]
+    others = [
+        run.search(point, problem, run.tolerance, aside=True, fallback=best, aim="the other minimum")
+        for point in points
+    ]
+    best, *rivals = _distinct([best, *others], problem)
+    run.others = run.others._replace(rivals=[rival.onward for rival in rivals])
+    return best, rivals
 
 
 def _reweighed(run: _Run, best: Point, problem: Problem, tolerance: float) -> tuple[Point, Problem]:
@@ -489,6 +500,10 @@ def solve(
     A fit that does not converge returns the best point found, with ``converged`` False and a message. Raises
     :class:`FitError` for a fit that cannot be started.
     """
+    if not isinstance(init, Atmosphere):
+        raise FitError(f"init: got {init!r}, expected an Atmosphere, like diffatmo.earth()")
+    if not isinstance(model, Model):
+        raise FitError(f"model: got {model!r}, expected a model, like diffatmo.models.Moments()")
     if max_steps < 1:
         raise FitError(f"max_steps: got {max_steps}, expected at least 1")
     if starts is not None and starts < 1:
@@ -522,6 +537,7 @@ def solve(
     else:
         run.history += [Step(**row) for row in saved.history]
         run.final, run.understated, run.step_size = saved.final, saved.understated, saved.step_size
+        run.max_steps = max(max_steps, saved.max_steps)
         run.others = _Others(saved.rivals, saved.tried, saved.given)
         y = array(saved.y, problem.start.dtype)
         start = run.evaluate(*problem.split(y), problem)

@@ -298,6 +298,7 @@ def test_white_balance_leaves_the_middle_channel():
         ({"exposure": ""}, "exposure"),
         ({"exposure": "fixed-per-channel"}, "exposure"),
         ({"exposure_value": 0.0}, "exposure_value"),
+        ({"exposure": 2.0}, "exposure: got 2.0, .*a number that is known is exposure_value"),
         ({"saturation": 0.0}, "saturation"),
         ({"max_pixels": 0}, "max_pixels"),
     ],

@@ -1,6 +1,7 @@
 """The search: it finds the optimum from far off, respects bounds, and when it cannot converge it says so."""
 
 import dataclasses
+import json
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -164,6 +165,12 @@ def test_a_checkpoint_of_another_fit_is_refused(tmp_path):
     for images, free in ((toy_sky.observations(), ["mie_scattering"]), (toy_sky.observations(seed=1), ["mie_g"])):
         with pytest.raises(FitError, match="belongs to a fit of other images or options"):
             fit(images, free=free, **settings)
+    with np.load(file) as archive:
+        y, record = archive["y"], json.loads(archive["record"].tobytes())
+    del record["rivals"]
+    np.savez(file, y=y, record=np.frombuffer(json.dumps(record).encode(), np.uint8))
+    with pytest.raises(FitError, match="written by another version"):
+        fit(toy_sky.observations(), free=["mie_g"], **settings)
     file.write_bytes(file.read_bytes()[:100])
     with pytest.raises(FitError, match="not a checkpoint of a fit"):
         fit(toy_sky.observations(), free=["mie_g"], **settings)
@@ -208,6 +215,8 @@ def test_refuses():
         ({"max_steps": 0}, "max_steps"),
         ({"tolerance": 0.0}, "tolerance"),
         ({"free": ["nothing"]}, "'nothing' cannot be free"),
+        ({"init": "earth"}, "init: got 'earth', expected an Atmosphere"),
+        ({"model": "hillaire"}, "model: got 'hillaire', expected a model"),
     ]:
         with pytest.raises(FitError, match=message):
             fit(images, **({"init": toy_sky.start(), "free": ["mie_g"], "model": Toy()} | options))

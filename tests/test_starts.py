@@ -7,7 +7,7 @@ import toy_sky
 from pattern_model import Twin, observation
 from toy_sky import FREE, Toy, truth
 
-from fitting import FitError, FitResult, fit, report
+from fitting import FitError, FitResult, Prior, fit, report
 from fitting.batch import stack
 from fitting.parameters import select
 from fitting.problem import Problem
@@ -113,9 +113,9 @@ def test_a_fit_that_does_not_go_astray_costs_nothing_more():
     assert [step.chi2 for step in found.history] == [step.chi2 for step in toy_sky.result().history]
 
 
-def twins(tilt, starts, **options):
+def twins(tilt, starts, stated=None, seed=0, **options):
     model = Twin(tilt)
-    seen = observation(model, toy_sky.change(truth(), mie_g=0.5))
+    seen = observation(model, toy_sky.change(truth(), mie_g=0.5), stated=stated, seed=seed)
     init = toy_sky.change(truth(), mie_g=0.2)
     return fit([seen], init=init, free=["mie_g"], model=model, starts=starts, **options)
 
@@ -150,6 +150,49 @@ def test_a_fit_killed_in_its_last_pass_still_knows_its_other_minimum(aim, tmp_pa
     assert found.converged
     assert len(seen) < 5
     assert sorted(minimum.values["mie_g"] for minimum in found.minima) == pytest.approx([-0.5, 0.5], abs=0.01)
+
+
+@pytest.mark.parametrize("seed", [0, 10])
+def test_minima_compare_by_the_same_noise(tmp_path, seed):
+    """Noise understated by four, and a prior that is weighed against what the residuals show: all is even in g, and so is χ².
+
+    Seed 10 ends in the other minimum; killed after that it has both as well.
+    """
+    settings = {"stated": 0.005, "seed": seed, "priors": [Prior("mie_g", 0.0, 0.02)]}
+    found = twins(0.0, 3, **settings)
+    one, other = found.minima
+    assert one.chi2 == pytest.approx(other.chi2, rel=1e-4)
+    assert one.values["mie_g"] == pytest.approx(-other.values["mie_g"], abs=1e-4)
+
+    class Killed(Exception):
+        pass
+
+    def kill(step):
+        if step.aim.startswith("what is known"):
+            raise Killed
+
+    with pytest.raises(Killed):
+        twins(0.0, 3, checkpoint=tmp_path / "checkpoint.npz", progress=kill, **settings)
+    resumed = twins(0.0, 3, checkpoint=tmp_path / "checkpoint.npz", **settings)
+    assert sorted(m.values["mie_g"] for m in resumed.minima) == pytest.approx(
+        sorted(m.values["mie_g"] for m in found.minima), abs=1e-3
+    )
+
+
+def test_a_fit_that_goes_on_has_the_steps_that_its_other_starts_had(tmp_path):
+    class Killed(Exception):
+        pass
+
+    def kill(step):
+        if step.aim == OF_FITTED_LIGHT:
+            raise Killed
+
+    file = tmp_path / "checkpoint.npz"
+    with pytest.raises(Killed):
+        twins(0.0, 3, checkpoint=file, progress=kill, max_steps=8)
+    found = twins(0.0, 3, checkpoint=file, max_steps=8)
+    assert len(found.history) > 8
+    assert found.converged
 
 
 def test_one_minimum_found_twice_is_one():
