@@ -77,6 +77,11 @@ class Batch(eqx.Module):
     mesh: Mesh | None = eqx.field(static=True, default=None)
     """The devices that share out the pixels, if there are several."""
 
+    @property
+    def pixel_fields(self) -> list[str]:
+        """Names of what there is for every pixel."""
+        return [*PIXEL_FIELDS, *(name for name in NOISE_FIELDS if getattr(self, name).shape[1] > 1)]
+
     def exposure(self, linear: Float[Array, " k"]) -> Float[Array, "image 1 w"]:
         """What radiance is multiplied by."""
         return self.exposure_value[:, None, None] * self.nuisances.factor(linear)

@@ -31,7 +31,7 @@ from jaxtyping import Array, Float, Int
 
 from diffatmo.atmosphere import Atmosphere
 from diffatmo.models import Sky
-from fitting.batch import NOISE_FIELDS, PIXEL_FIELDS, Views
+from fitting.batch import PIXEL_FIELDS, Views
 from fitting.correction import apply
 from fitting.nuisances import AEROSOL, SHADING
 from fitting.parameters import Coordinates
@@ -83,8 +83,8 @@ def linearise(x: Coordinates, linear: Linear, problem: Problem) -> Linearisation
 def spread(problem: Problem, everywhere: T, apart: T) -> Any:
     """``apart`` for every array of ``problem`` that has pixels, ``everywhere`` for any other."""
     of_correction = lambda p: [] if problem.correction is None else [p.correction.ratio, p.correction.slope]
-    varied = [name for name in NOISE_FIELDS if getattr(problem.batch, name).shape[1] > 1]
-    where = lambda p: [p.weight, *of_correction(p), *(getattr(p.batch, name) for name in (*PIXEL_FIELDS, *varied))]
+    names = problem.batch.pixel_fields
+    where = lambda p: [p.weight, *of_correction(p), *(getattr(p.batch, name) for name in names)]
     marks = jax.tree.map(lambda _: everywhere, problem)
     return eqx.tree_at(
         where, marks, replace_fn=lambda leaf: leaf if leaf is None else apart, is_leaf=lambda x: x is None

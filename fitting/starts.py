@@ -24,7 +24,7 @@ from jaxtyping import Array, Float, Int
 
 from diffatmo.compiling import outermost
 from diffatmo.numerics import array
-from fitting.batch import NOISE_FIELDS, PIXEL_FIELDS, Batch
+from fitting.batch import Batch
 from fitting.elimination import starting
 from fitting.parameters import Aerosol, Block, Coordinates, Parameters, Single
 from fitting.problem import Predicted, Problem, predict
@@ -112,8 +112,7 @@ def thinned(batch: Batch, count: int = PIXELS) -> tuple[Batch, Int[np.ndarray, "
     size = min(count, used.shape[1])
     chosen = np.stack([np.flatnonzero(row)[np.linspace(0, row.sum() - 1, size).astype(int)] for row in used])
     image = np.arange(len(used))[:, None]
-    varied = [name for name in NOISE_FIELDS if getattr(batch, name).shape[1] > 1]
-    of_pixels = {name: getattr(batch, name)[image, chosen] for name in (*PIXEL_FIELDS, *varied)}
+    of_pixels = {name: getattr(batch, name)[image, chosen] for name in batch.pixel_fields}
     return replace(batch, tiles=1, mesh=None, **of_pixels), chosen
 
 
