@@ -6,6 +6,7 @@ holds, is the same with those uses as its methods.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from difflib import get_close_matches
 from statistics import NormalDist
 from typing import Self
 
@@ -229,11 +230,13 @@ class Findings:
         return [*self.parameters, *self.nuisances]
 
     def estimate(self, name: str) -> Estimate:
-        """The parameter, derived quantity or nuisance called ``name``."""
+        """The parameter, derived quantity or nuisance called ``name``; raises KeyError for any other."""
         for estimate in self.estimates:
             if estimate.name == name:
                 return estimate
-        raise KeyError(name)
+        names = [estimate.name for estimate in self.estimates]
+        like = get_close_matches(name, names, n=3, cutoff=0.5) or names
+        raise KeyError(f"{name}: no number of this fit; expected one like {', '.join(like)}")
 
     def with_truth(self, truth: Atmosphere) -> Self:
         """The same with the true value beside each parameter; raises :class:`FitError` for other wavelengths."""

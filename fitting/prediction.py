@@ -122,9 +122,13 @@ def predict(result: Findings, scene: Scene, *, model: Model | None = None, expos
         exposure: Name of a fitted exposure factor that multiplies the picture, as it did the images of which it was found:
             ``exposure_camera``, without the wavelength where there is one for each.
 
-    The picture, and about a dozen modes of its size, are held in memory. Raises :class:`FitError` for a scene with other
-    wavelengths, an unknown exposure, or a fit by a model that is not known any more.
+    The picture, and about a dozen modes of its size, are held in memory. Raises :class:`FitError` for what is no scene or one
+    with other wavelengths, an unknown exposure, or a fit by a model that is not known any more.
     """
+    if not isinstance(scene, Scene):
+        raise FitError(
+            f"scene: got {type(scene).__name__}, expected a Scene: diffatmo.Scene(atmosphere, camera, altitude, sun)"
+        )
     wavelengths = [float(nm) for nm in result.atmosphere.wavelengths]
     given = np.asarray(scene.atmosphere.wavelengths)
     if given.size != len(wavelengths) or not np.allclose(given, wavelengths):

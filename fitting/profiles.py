@@ -90,11 +90,13 @@ def profile(
     """``result`` with profiles of the numbers ``names`` in its ``profiles``; a spectral field stands for all of its numbers.
 
     ``points`` is the number of values, and ``progress`` is given each: the name, the value and Δχ². After an interrupt, the
-    profiles that were finished are there. Raises :class:`FitError` for a name that is not a number of the atmosphere in the
-    result, and for a result without what it takes to fit again.
+    profiles that were finished are there. Raises :class:`FitError` for no name, one that is not a number of the atmosphere in
+    the result, and for a result without what it takes to fit again.
     """
     if points < FEWEST_POINTS:
         raise FitError(f"points: got {points}, expected at least {FEWEST_POINTS}")
+    if not names:
+        raise FitError("profile: names: got none, expected numbers of the fit, like 'mie_g'")
     wanted = chosen(result.parameters, names)
     found = {each.name: each for each in result.profiles}
     try:

@@ -205,7 +205,7 @@ def fit(
     init: Atmosphere,
     free: Sequence[str],
     tie: Mapping[str, str] | None = None,
-    priors: Sequence[Prior] = (),
+    priors: Prior | Sequence[Prior] = (),
     loss: str | None = None,
     model: Model | None = None,
     progress: Progress | None = None,
@@ -226,7 +226,7 @@ def fit(
         tie: How the wavelengths of a spectral field hang together, name -> kind: ``start`` (a common factor times the
             values of ``init``), ``grey``, ``lambda^-4`` (of ``rayleigh_scattering``), ``dobson`` (of ``ozone_absorption``), or
             ``{"mie": "angstrom"}``; see :mod:`fitting.parameters`.
-        priors: What is known beforehand (:mod:`fitting.priors`).
+        priors: What is known beforehand (:mod:`fitting.priors`), one or several.
         loss: None for least squares; ``huber``, ``cauchy`` or ``tukey`` where clouds or objects are in the picture
             (:mod:`fitting.robust`).
         model: How the sky is computed, :class:`~diffatmo.models.moments.Moments` by default.
@@ -252,6 +252,7 @@ def fit(
     """
     model = Moments() if model is None else model
     observations = [observations] if isinstance(observations, Observation) else observations
+    priors = [priors] if isinstance(priors, Prior) else priors
     solution = solve(
         observations,
         init=init,

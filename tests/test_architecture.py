@@ -58,6 +58,8 @@ LEVELS = [
     ["fitting.starts", "fitting.search"],
     ["fitting.model_error"],
     ["fitting.evaluation"],
+    ["fitting.run"],
+    ["fitting.passes"],
     ["fitting.solve"],
     ["fitting.findings"],
     ["fitting.combinations"],

@@ -123,6 +123,8 @@ def test_what_cannot_be_profiled_is_refused(tmp_path):
     result = linear()
     with pytest.raises(FitError, match="'mie_g' is no number of this fit; numbers are of ground_albedo"):
         profile(result, "mie_g")
+    with pytest.raises(FitError, match="names: got none"):
+        profile(result)
     with pytest.raises(FitError, match="points: got 3, expected at least 5"):
         profile(result, "ground_albedo_550", points=3)
     result.save(tmp_path / "fit.npz")

@@ -424,6 +424,13 @@ def test_images_of_something_else_are_refused():
     other = toy_sky.change(toy_sky.truth(), wavelengths=[600.0, 500.0, 400.0])
     with pytest.raises(FitError, match="scene: has wavelengths"):
         toy_sky.result().predict(scene(atmosphere=other))
+    with pytest.raises(FitError, match="scene: got Observation, expected a Scene"):
+        toy_sky.result().predict(observed()[0])
+
+
+def test_a_misspelt_number_is_answered_with_its_like():
+    with pytest.raises(KeyError, match="mie_G: no number of this fit; expected one like mie_g"):
+        toy_sky.result().estimate("mie_G")
 
 
 def test_a_finer_model_has_the_last_word():

@@ -11,8 +11,7 @@ import toy_sky
 from toy_sky import FREE, Hasty, Toy
 
 from diffatmo.models.base import Ray
-from fitting import FitError, evaluation, fit, model_error, profile, tables
-from fitting import solve as solving
+from fitting import FitError, evaluation, fit, model_error, passes, profile, tables
 from fitting.search import Step, distance, steps_left
 from fitting.solve import solve
 
@@ -366,7 +365,7 @@ def test_the_finer_model_is_asked_again_where_its_correction_moves_the_optimum(m
     result, off = found()
     assert result.converged, result.message
     assert off < 0.5
-    monkeypatch.setattr(solving, "CORRECTIONS", 1)
+    monkeypatch.setattr(passes, "CORRECTIONS", 1)
     result, off = found()
     assert off > 2
     assert not result.converged

@@ -10,8 +10,8 @@ from toy_sky import FREE, Toy, truth
 from fitting import FitError, FitResult, Prior, fit, report
 from fitting.batch import stack
 from fitting.parameters import select
+from fitting.passes import OF_FITTED_LIGHT
 from fitting.problem import Problem
-from fitting.solve import OF_FITTED_LIGHT
 from fitting.starts import grid, ranked, separation, thinned
 from fitting.tables import notes
 
