@@ -6,6 +6,8 @@ everything said about the fit; another fit refuses it.
 
 import hashlib
 import json
+import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,6 +19,19 @@ from diffatmo import imageio
 from fitting._errors import DAMAGED, FitError
 
 FILE = "checkpoint.npz"
+
+
+class Others(NamedTuple):
+    """What other starts have led to; points are in the coordinates of the fit."""
+
+    rivals: Sequence[list[float]] = ()
+    """Points near other minima than the best."""
+    tried: int = 0
+    """How many starts have been tried, when all that are wanted were."""
+    given: float = math.nan
+    """χ² of what the start that was given led to."""
+    underway: Sequence[list[float]] = ()
+    """Until then, how far each has come; all but the last have ended."""
 
 
 class Checkpoint(NamedTuple):
@@ -32,12 +47,7 @@ class Checkpoint(NamedTuple):
     """Whether sigma comes from the fitted signal already."""
     understated: float
     """Factor between the residuals and the noise, as far as the fit knows it."""
-    rivals: list[list[float]]
-    """Points near the other minima, if there are some."""
-    tried: int
-    """Other starts that were tried."""
-    given: float
-    """χ² of what the start that was given led to, if others were tried."""
+    others: Others
     history: list[dict[str, Any]]
     """A row for each step."""
 
@@ -71,6 +81,8 @@ def load(path: Path, fit: str) -> Checkpoint | None:
             y, record = archive["y"], json.loads(archive["record"].tobytes())
         owner = record.pop("fit")
         checkpoint = Checkpoint(y, **record) if {"y", *record} == {*Checkpoint._fields} else None
+        if checkpoint is not None:
+            checkpoint = checkpoint._replace(others=Others(*record["others"]))
     except OSError as error:
         raise FitError(f"{path}: cannot be read: {error.strerror or error}") from error
     except DAMAGED as error:

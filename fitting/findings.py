@@ -235,7 +235,7 @@ class Findings:
             if estimate.name == name:
                 return estimate
         names = [estimate.name for estimate in self.estimates]
-        like = get_close_matches(name, names, n=3, cutoff=0.5) or names
+        like = get_close_matches(str(name), names, n=3, cutoff=0.5) or names
         raise KeyError(f"{name}: no number of this fit; expected one like {', '.join(like)}")
 
     def with_truth(self, truth: Atmosphere) -> Self:

@@ -19,7 +19,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import islice
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -29,6 +29,7 @@ from diffatmo.compiling import outermost
 from diffatmo.models.base import Model
 from diffatmo.numerics import array
 from fitting import model_error
+from fitting.checkpoint import Others
 from fitting.correction import Correction
 from fitting.evaluation import corrected, rescaled, weighed
 from fitting.least_squares import reduce_images
@@ -85,13 +86,11 @@ RESTLESS = (
 
 
 class Found(NamedTuple):
-    """The best point of a pass, other minima, and what the search from the given start led to if there were others."""
+    """The best point of a pass, and other minima."""
 
     best: Point
     rivals: list[Point]
     problem: Problem
-    tried: int = 0
-    given: float = math.nan
 
     @property
     def interrupted(self) -> bool:
@@ -110,7 +109,9 @@ def first_pass(run: Run, y: Coordinates, start: Linearisation, problem: Problem,
     found: Found | None = None
     while True:
         problem = rescaled(here, radiance, problem)
-        patience = PATIENCE if starts is None and found is None else None
+        impatient = starts is None and found is None and not run.others.tried
+        # Of a run that was broken off, some steps are taken already.
+        patience = max(1, PATIENCE - len(run.history)) if impatient else None
         fallback = None if found is None else found.best
         best = run.search(y, problem, rough, start=known, patience=patience, fallback=fallback)
         if problem.batch.nuisances.pedestals:
@@ -142,7 +143,7 @@ def final_pass(run: Run, y: Coordinates, problem: Problem, before: Found | None 
     if problem is not alone and best.message != INTERRUPTED:
         # Minima compare by the same noise.
         best, rivals = _among_others(run, best, problem)
-    return Found(best, rivals, problem, run.others.tried, run.others.given)
+    return Found(best, rivals, problem)
 
 
 def refined(run: Run, found: Found, finer: Model) -> tuple[Found, Float[np.ndarray, "n n"]]:
@@ -199,7 +200,8 @@ def _rescued(run: Run, best: Point, problem: Problem, starts: int | None, rough:
     """``best``, or what other starts lead to: as many as were asked for, or a few if it has gone astray."""
     astray = ASTRAY * max(count(problem.batch) - best.y.size, 1)
     wanted = starts - 1 if starts is not None else OTHERS * (best.chi2 > astray)
-    if not wanted or best.message == INTERRUPTED or len(run.history) >= run.max_steps:
+    spent = len(run.history) >= run.max_steps and not run.others.underway
+    if not wanted or run.others.tried or best.message == INTERRUPTED or spent:
         return Found(best, [], problem)
     points, each = [best], run.max_steps
     try:
@@ -213,18 +215,26 @@ def _rescued(run: Run, best: Point, problem: Problem, starts: int | None, rough:
         points[0] = best._replace(converged=False, message=INTERRUPTED)
     run.max_steps = len(run.history) + each
     first, *rivals = _distinct(points, problem)
-    return Found(first, rivals, problem, len(points) - 1, best.chi2)
+    if first.message != INTERRUPTED:
+        run.others = Others(_onward(rivals), len(points) - 1, best.chi2)
+    return Found(first, rivals, problem)
 
 
 def _elsewhere(run: Run, problem: Problem, rough: float, steps: int) -> Iterator[Point]:
     """Where searches from other starts end, the most promising first, in up to so many steps together."""
     dtype, last = problem.start.dtype, len(run.history) + steps
+    begun = list(run.others.underway)
     for point in ranked(problem):
         x = array(np.append(point, np.zeros(problem.batch.nuisances.offsets)), dtype)
         y, start = run.begin(x, problem)
-        if not np.asarray(start.bad).any():
-            left = last - len(run.history)
-            yield run.search(y, problem, rough, aside=True, steps=left, start=start, aim="from another start")
+        if np.asarray(start.bad).any():
+            continue
+        options: dict[str, Any] = {"aside": True, "steps": last - len(run.history), "aim": "from another start"}
+        if begun:
+            yield run.search(array(begun.pop(0), dtype), problem, rough, **options)
+        else:
+            run.others = run.others._replace(underway=[*run.others.underway, np.asarray(y).tolist()])
+            yield run.search(y, problem, rough, start=start, **options)
 
 
 def _among_others(run: Run, best: Point, problem: Problem) -> tuple[Point, list[Point]]:
@@ -235,8 +245,12 @@ def _among_others(run: Run, best: Point, problem: Problem) -> tuple[Point, list[
         for point in points
     ]
     best, *rivals = _distinct([best, *others], problem)
-    run.others = run.others._replace(rivals=[rival.onward for rival in rivals])
+    run.others = run.others._replace(rivals=_onward(rivals))
     return best, rivals
+
+
+def _onward(points: Sequence[Point]) -> list[list[float]]:
+    return [np.asarray(point.onward).tolist() for point in points]
 
 
 def _distinct(points: Sequence[Point], problem: Problem) -> list[Point]:

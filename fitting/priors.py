@@ -85,8 +85,6 @@ def collect(priors: Sequence[Prior], parameters: Parameters) -> Priors | None:
     index: list[int] = []
     stated: list[Prior] = []
     for prior in priors:
-        if not isinstance(prior, Prior):
-            raise FitError(f"priors: got {prior!r}, expected fitting.Prior(name, value, error)")
         if not (SMALLEST <= prior.error <= LARGEST and abs(prior.value) <= LARGEST):
             raise FitError(
                 f"prior: {prior}: expected a finite value and a finite error > 0, the value up to {LARGEST:g}, the error from "

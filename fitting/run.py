@@ -1,12 +1,10 @@
 """A fit on its way: what has been done, what is left to be spent, and what is kept of it on disk."""
 
-import math
 import time
 import warnings
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,21 +12,13 @@ import numpy as np
 
 from diffatmo.numerics import array
 from fitting._errors import FitError
-from fitting.checkpoint import Checkpoint, save
+from fitting.checkpoint import Checkpoint, Others, save
 from fitting.elimination import starting
 from fitting.evaluation import evaluated
 from fitting.linearisation import Linearisation
 from fitting.parameters import Coordinates
 from fitting.problem import Linear, Problem
 from fitting.search import Point, Progress, Step, minimise
-
-
-class Others(NamedTuple):
-    """What other starts have led to: points near other minima, how many were tried, and χ² of what the given one led to."""
-
-    rivals: Sequence[Coordinates | list[float]] = ()
-    tried: int = 0
-    given: float = math.nan
 
 
 @dataclass
@@ -47,6 +37,8 @@ class Run:
     understated: float = 1.0
     """Factor between the residuals and the noise, where that matters."""
     others: Others = field(default_factory=Others)
+    best: tuple[np.ndarray, float] | None = None
+    """The best point of the present stage, and the step size there."""
     step_size: float | None = None
     """That of a search that was broken off, for the one that goes on; any other begins with its own."""
 
@@ -79,20 +71,31 @@ class Run:
             max_steps=len(self.history) + steps if steps else self.max_steps,
             history=self.history,
             progress=self.progress,
-            keep=(lambda *_: None) if aside else self.keep,
+            keep=self.keep_aside if aside else self.keep,
             step_size=step_size,
             **options,
         )
 
     def keep(self, y: Coordinates, step_size: float) -> None:
-        """Write the best point to the checkpoint. Of several processes, which all come here with the same, one does."""
-        if self.checkpoint is None or jax.process_index() > 0:
+        """Write the best point to the checkpoint."""
+        self.best = np.asarray(y), step_size
+        self._write()
+
+    def keep_aside(self, y: Coordinates, step_size: float) -> None:
+        """Write how far the search from another start has come, if that is what goes on; it would begin with its own step."""
+        if self.others.underway:
+            ended = self.others.underway[:-1]
+            self.others = self.others._replace(underway=[*ended, np.asarray(y).tolist()])
+            self._write()
+
+    def _write(self) -> None:
+        """Of several processes, which all come here with the same, one does."""
+        if self.checkpoint is None or self.best is None or jax.process_index() > 0:
             return
         rows = [step._asdict() for step in self.history]
-        rivals = [np.asarray(other).tolist() for other in self.others.rivals]
-        state = (self.max_steps, self.final, self.understated, rivals, self.others.tried, self.others.given, rows)
+        state = Checkpoint(*self.best, self.max_steps, self.final, self.understated, self.others, rows)
         try:
-            save(self.checkpoint, self.identity, Checkpoint(np.asarray(y), step_size, *state))
+            save(self.checkpoint, self.identity, state)
         except FitError as error:
             warnings.warn(f"{error}; the fit goes on without a checkpoint", stacklevel=2)
             self.checkpoint = None

@@ -33,7 +33,7 @@ from fitting.parameters import Coordinates, Parameters, select
 from fitting.passes import final_pass, first_pass, refined, understated
 from fitting.priors import Prior
 from fitting.problem import Predicted, Problem, expected, planet_shell, whitened
-from fitting.run import Others, Run
+from fitting.run import Run
 from fitting.search import Point, Progress, Step, count
 from fitting.starts import RIVAL
 
@@ -125,8 +125,8 @@ def solve(
         raise FitError(f"max_steps: got {max_steps}, expected at least 1")
     if starts is not None and starts < 1:
         raise FitError(f"starts: got {starts}, expected at least 1")
-    if not tolerance > 0:
-        raise FitError(f"tolerance: got {tolerance}, expected a number > 0")
+    if not 0 < tolerance < math.inf:
+        raise FitError(f"tolerance: got {tolerance}, expected a finite number > 0")
     began = time.perf_counter()
     parameters = select(init, free, tie)
     # A checkpoint that does not belong here is found before anything is computed.
@@ -155,7 +155,7 @@ def solve(
         run.history += [Step(**row) for row in saved.history]
         run.final, run.understated, run.step_size = saved.final, saved.understated, saved.step_size
         run.max_steps = max(max_steps, saved.max_steps)
-        run.others = Others(saved.rivals, saved.tried, saved.given)
+        run.others = saved.others
         y = array(saved.y, problem.start.dtype)
         start = run.evaluate(*problem.split(y), problem)
     check_finite(np.asarray(start.bad), names, "at the start")
@@ -167,7 +167,6 @@ def solve(
         # As large as the images are, and of no use any more.
         del start
         if not found.interrupted:
-            run.others = Others([rival.onward for rival in found.rivals], found.tried, found.given)
             best = found.best
             problem = weighed(best.y, best.linearisation.radiance, found.problem)
             found = final_pass(run, best.onward, problem, found)
@@ -181,8 +180,9 @@ def solve(
     misfit = float(np.sum(best.triangle[:, -1] ** 2)) / max(count(batch) - size, 1)
     if best.converged and misfit > HOPELESS_MISFIT:
         best = best._replace(converged=False, message=UNLIKE.format(math.sqrt(misfit)))
-    if best.converged and found.given > RIVAL * best.chi2:
-        best = best._replace(message=ELSEWHERE.format(best.message, found.tried, found.given / best.chi2))
+    tried, given = run.others.tried, run.others.given
+    if best.converged and given > RIVAL * best.chi2:
+        best = best._replace(message=ELSEWHERE.format(best.message, tried, given / best.chi2))
     total = time.perf_counter() - began
     # What a typical evaluation does not explain is compilation and preparation, which happen once.
     evaluations = min(total, len(run.seconds) * float(np.median(run.seconds)))

@@ -18,9 +18,9 @@ against it with the noise that they show (:attr:`fitting.problem.Problem.underst
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -31,6 +31,7 @@ from diffatmo.atmosphere import Atmosphere
 from diffatmo.compiling import outermost
 from diffatmo.models import Model, Moments
 from diffatmo.numerics import array
+from fitting._errors import FitError
 from fitting.elimination import RANK_TOLERANCE
 from fitting.findings import Estimate, Minimum, Setup
 from fitting.nuisances import Nuisances, assumed
@@ -41,6 +42,8 @@ from fitting.quantities import numbers, quantities
 from fitting.result import FitResult
 from fitting.search import Progress
 from fitting.solve import MAX_STEPS, TOLERANCE, Solution, solve
+
+T = TypeVar("T")
 
 
 def propagate(
@@ -185,6 +188,15 @@ def summarise(
     )
 
 
+def _listed(given: T | Iterable[T], kind: type[T], name: str, expected: str) -> list[T]:
+    """What may be given alone, or several of them, as a list."""
+    found = list(given) if isinstance(given, Iterable) and not isinstance(given, kind) else [given]
+    for one in found:
+        if not isinstance(one, kind):
+            raise FitError(f"{name}: got {type(one).__name__}, expected {expected}")
+    return found
+
+
 def _minima(solution: Solution) -> list[Minimum]:
     """The minima of the solution in the numbers that are reported."""
     parameters = solution.parameters
@@ -251,8 +263,11 @@ def fit(
             that is not finite at the start.
     """
     model = Moments() if model is None else model
-    observations = [observations] if isinstance(observations, Observation) else observations
-    priors = [priors] if isinstance(priors, Prior) else priors
+    observations = _listed(observations, Observation, "observations", "fitting.observe(...), or a list of them")
+    priors = _listed(priors, Prior, "priors", "fitting.Prior(name, value, error), or a list of them")
+    free = free if isinstance(free, str) else _listed(free, str, "free", "a list of names of parameters")
+    if not (starts is None or isinstance(starts, int)):
+        raise FitError(f"starts: got {starts!r}, expected a whole number")
     solution = solve(
         observations,
         init=init,

@@ -166,7 +166,7 @@ def test_a_checkpoint_of_another_fit_is_refused(tmp_path):
             fit(images, free=free, **settings)
     with np.load(file) as archive:
         y, record = archive["y"], json.loads(archive["record"].tobytes())
-    del record["rivals"]
+    del record["others"]
     np.savez(file, y=y, record=np.frombuffer(json.dumps(record).encode(), np.uint8))
     with pytest.raises(FitError, match="written by another version"):
         fit(toy_sky.observations(), free=["mie_g"], **settings)
@@ -213,12 +213,18 @@ def test_refuses():
     for options, message in [
         ({"max_steps": 0}, "max_steps"),
         ({"tolerance": 0.0}, "tolerance"),
+        ({"tolerance": float("inf")}, "tolerance: got inf, expected a finite number"),
+        ({"starts": 1.5}, "starts: got 1.5, expected a whole number"),
+        ({"observations": images[0].image}, r"observations: got ndarray, expected fitting.observe\(...\)"),
+        ({"priors": {"mie_g": 0.7}}, r"priors: got str, expected fitting.Prior\(name, value, error\)"),
+        ({"priors": None}, "priors: got NoneType, expected"),
+        ({"free": None}, "free: got NoneType, expected a list of names"),
         ({"free": ["nothing"]}, "'nothing' cannot be free"),
         ({"init": "earth"}, "init: got 'earth', expected an Atmosphere"),
         ({"model": "hillaire"}, "model: got 'hillaire', expected a model"),
     ]:
         with pytest.raises(FitError, match=message):
-            fit(images, **({"init": toy_sky.start(), "free": ["mie_g"], "model": Toy()} | options))
+            fit(**({"observations": images, "init": toy_sky.start(), "free": ["mie_g"], "model": Toy()} | options))
     one = eqx.tree_at(lambda o: o.used, images[0], images[0].used & (np.arange(16 * 64).reshape(16, 64) == 500))
     with pytest.raises(FitError, match="3 pixels and channels cannot determine"):
         fit([one], init=toy_sky.start(), free=FREE, model=Toy())

@@ -108,6 +108,38 @@ def test_a_fit_that_goes_astray_begins_anew():
         assert found.estimate(estimate.name).value == pytest.approx(estimate.value, abs=0.7 * estimate.standard_error)
 
 
+@pytest.mark.parametrize(
+    ("loss", "number", "aim"),
+    [(None, 20, ""), (None, 41, "from another start"), ("tukey", 42, "")],
+    ids=["at its own start", "at another", "in a later stage"],
+)
+def test_killed_before_its_last_pass_it_goes_on_where_it_was(loss, number, aim, tmp_path):
+    """Two steps at most are made twice: one of the given start's search, one of another's."""
+
+    class Killed(Exception):
+        pass
+
+    def kill(step):
+        if step.step == number and file.exists():
+            assert step.aim == aim
+            raise Killed
+
+    said = {"init": wrong(0.2, 2, 0.5, -0.3), "free": FREE, "model": Toy(), "loss": loss}
+    found = fit(toy_sky.observations(), **said)
+    file = tmp_path / "checkpoint.npz"
+    with pytest.raises(Killed):
+        fit(toy_sky.observations(), checkpoint=file, progress=kill, **said)
+    resumed = fit(toy_sky.observations(), checkpoint=file, **said)
+    assert "from one of 1 other starts" in resumed.message
+    assert resumed.message.split(";")[1] == found.message.split(";")[1]
+    assert len(resumed.history) <= len(found.history) + 2
+    np.testing.assert_allclose(
+        [estimate.value for estimate in resumed.parameters],
+        [estimate.value for estimate in found.parameters],
+        atol=0.1 * max(estimate.standard_error for estimate in found.parameters),
+    )
+
+
 def test_a_fit_that_does_not_go_astray_costs_nothing_more():
     found = fit(toy_sky.observations(), init=toy_sky.start(), free=FREE, model=Toy(), starts=1)
     assert [step.chi2 for step in found.history] == [step.chi2 for step in toy_sky.result().history]
