@@ -1,8 +1,10 @@
-"""The one error of this package, and those of reading a damaged file."""
+"""The one error of this package, what it says of names that are not known, and the errors of reading a damaged file."""
 
+import difflib
 import tokenize
 import zipfile
 import zlib
+from collections.abc import Sequence
 
 DAMAGED = (
     ValueError,
@@ -22,3 +24,9 @@ DAMAGED = (
 
 class FitError(ValueError):
     """A fit was asked for that cannot be done; the message says what is wrong and what would be right."""
+
+
+def did_you_mean(name: object, known: Sequence[str]) -> str:
+    """The end of a sentence about a ``name`` that is none of ``known``; empty if none is like it."""
+    close = difflib.get_close_matches(str(name), known, n=1)
+    return f", did you mean {close[0]!r}?" if close else ""

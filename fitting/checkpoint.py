@@ -80,9 +80,8 @@ def load(path: Path, fit: str) -> Checkpoint | None:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             y, record = archive["y"], json.loads(archive["record"].tobytes())
         owner = record.pop("fit")
-        checkpoint = Checkpoint(y, **record) if {"y", *record} == {*Checkpoint._fields} else None
-        if checkpoint is not None:
-            checkpoint = checkpoint._replace(others=Others(*record["others"]))
+        whole = {"y", *record} == {*Checkpoint._fields}
+        checkpoint = Checkpoint(y, **record | {"others": Others(*record["others"])}) if whole else None
     except OSError as error:
         raise FitError(f"{path}: cannot be read: {error.strerror or error}") from error
     except DAMAGED as error:

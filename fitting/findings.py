@@ -6,7 +6,6 @@ holds, is the same with those uses as its methods.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from difflib import get_close_matches
 from statistics import NormalDist
 from typing import Self
 
@@ -15,7 +14,7 @@ from jaxtyping import Bool, Float
 
 from diffatmo.atmosphere import Atmosphere
 from diffatmo.models import Model
-from fitting._errors import FitError
+from fitting._errors import FitError, did_you_mean
 from fitting.nuisances import channel_names, group_of
 from fitting.observation import Observation, sigma
 from fitting.priors import Prior
@@ -235,8 +234,8 @@ class Findings:
             if estimate.name == name:
                 return estimate
         names = [estimate.name for estimate in self.estimates]
-        like = get_close_matches(str(name), names, n=3, cutoff=0.5) or names
-        raise KeyError(f"{name}: no number of this fit; expected one like {', '.join(like)}")
+        hint = did_you_mean(name, names) or ";"
+        raise KeyError(f"{name!r} is no number of this fit{hint} numbers are {', '.join(names)}")
 
     def with_truth(self, truth: Atmosphere) -> Self:
         """The same with the true value beside each parameter; raises :class:`FitError` for other wavelengths."""

@@ -18,7 +18,6 @@ tie             meaning                                                         
 ==============  ======================================================================================  =================
 """
 
-import difflib
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeAlias
@@ -34,7 +33,7 @@ from diffatmo.atmosphere import SPECTRAL, Atmosphere
 from diffatmo.compiling import outermost
 from diffatmo.numerics import array, safe_divide
 from diffatmo.phase import PhaseTable
-from fitting._errors import FitError
+from fitting._errors import FitError, did_you_mean
 from fitting.bijections import Bijection, Linear, Log, Logit
 from fitting.quantities import ALWAYS, REFERENCE_NM, derived_fields
 
@@ -317,9 +316,7 @@ FREE_FIELDS = tuple(_CHOICES)
 
 
 def _unknown(name: Any, allowed: Sequence[str]) -> str:
-    close = difflib.get_close_matches(str(name), allowed, n=1)
-    hint = f"; did you mean {close[0]!r}?" if close else ""
-    return f"{name!r} cannot be free{hint} (possible: {', '.join(allowed)})"
+    return f"{name!r} cannot be free{did_you_mean(name, allowed)} (possible: {', '.join(allowed)})"
 
 
 def select(init: Atmosphere, free: Sequence[str], tie: Mapping[str, str] | None = None) -> Parameters:

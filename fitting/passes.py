@@ -18,8 +18,9 @@ it matters, how the comparison changes (:mod:`fitting.correction`). Where that m
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import islice
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -199,8 +200,10 @@ def refined(run: Run, found: Found, finer: Model) -> tuple[Found, Float[np.ndarr
 def _rescued(run: Run, best: Point, problem: Problem, starts: int | None, rough: float) -> Found:
     """``best``, or what other starts lead to: as many as were asked for, or a few if it has gone astray."""
     astray = ASTRAY * max(count(problem.batch) - best.y.size, 1)
-    wanted = starts - 1 if starts is not None else OTHERS * (best.chi2 > astray)
-    spent = len(run.history) >= run.max_steps and not run.others.underway
+    # Of a run that was broken off, others may have begun.
+    begun = bool(run.others.underway)
+    wanted = starts - 1 if starts is not None else OTHERS * (begun or best.chi2 > astray)
+    spent = len(run.history) >= run.max_steps and not begun
     if not wanted or run.others.tried or best.message == INTERRUPTED or spent:
         return Found(best, [], problem)
     points, each = [best], run.max_steps
@@ -223,25 +226,25 @@ def _rescued(run: Run, best: Point, problem: Problem, starts: int | None, rough:
 def _elsewhere(run: Run, problem: Problem, rough: float, steps: int) -> Iterator[Point]:
     """Where searches from other starts end, the most promising first, in up to so many steps together."""
     dtype, last = problem.start.dtype, len(run.history) + steps
-    begun = list(run.others.underway)
+    begun, number = run.others.underway, 0
     for point in ranked(problem):
         x = array(np.append(point, np.zeros(problem.batch.nuisances.offsets)), dtype)
         y, start = run.begin(x, problem)
         if np.asarray(start.bad).any():
             continue
-        options: dict[str, Any] = {"aside": True, "steps": last - len(run.history), "aim": "from another start"}
-        if begun:
-            yield run.search(array(begun.pop(0), dtype), problem, rough, **options)
-        else:
-            run.others = run.others._replace(underway=[*run.others.underway, np.asarray(y).tolist()])
-            yield run.search(y, problem, rough, start=start, **options)
+        keep, left = partial(run.keep_aside, number), last - len(run.history)
+        known: Linearisation | None = start
+        if number < len(begun):
+            y, known = array(begun[number], dtype), None
+        number += 1
+        yield run.search(y, problem, rough, keep=keep, steps=left, start=known, aim="from another start")
 
 
 def _among_others(run: Run, best: Point, problem: Problem) -> tuple[Point, list[Point]]:
     """The best of ``best`` and of the minima near those of ``run.others``, and its rivals, which are those from there on."""
     points = [array(other, best.y.dtype) for other in run.others.rivals]
     others = [
-        run.search(point, problem, run.tolerance, aside=True, fallback=best, aim="the other minimum")
+        run.search(point, problem, run.tolerance, keep=lambda *_: None, fallback=best, aim="the other minimum")
         for point in points
     ]
     best, *rivals = _distinct([best, *others], problem)

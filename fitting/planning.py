@@ -21,7 +21,6 @@ The bounds know the noise alone. Clouds, flare, and what the model leaves out ar
 pixels keeps it only as far as the model is right.
 """
 
-import difflib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -38,7 +37,7 @@ from diffatmo.camera import Camera, Fisheye, Pinhole
 from diffatmo.compiling import compile_ahead, outermost
 from diffatmo.models import Model, Moments
 from diffatmo.numerics import array, safe_log
-from fitting._errors import FitError
+from fitting._errors import FitError, did_you_mean
 from fitting.batch import Batch, stack
 from fitting.elimination import eliminate, starting, without
 from fitting.evaluation import check_finite, evaluated, pose
@@ -475,8 +474,7 @@ def ask(parameters: Parameters, aims: Sequence[str]) -> tuple[Question, list[Qua
     for name in aims:
         members[name] = np.array([name in (quantity.name, quantity.field) for quantity in named])
         if not members[name].any():
-            close = difflib.get_close_matches(name, [*fields, *(quantity.name for quantity in named)], n=1)
-            hint = f", did you mean {close[0]!r}?" if close else ""
+            hint = did_you_mean(name, [*fields, *(quantity.name for quantity in named)])
             raise FitError(f"for: {name!r} is not free and does not follow from what is{hint} ({', '.join(fields)})")
     gradient, values = outermost(_gradient)(parameters.start, parameters, tuple(fields))
     return Question(np.asarray(gradient, float), members), named, np.asarray(values, float)

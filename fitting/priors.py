@@ -5,7 +5,6 @@ fit as one more residual, (number - value) / error, and the result says for ever
 images' own. The named priors state what the field knows anyway, each with its source.
 """
 
-import difflib
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,7 +19,7 @@ from diffatmo import constants, spectrum
 from diffatmo.atmosphere import Atmosphere
 from diffatmo.compiling import outermost
 from diffatmo.numerics import array, safe_log
-from fitting._errors import FitError
+from fitting._errors import FitError, did_you_mean
 from fitting.parameters import Coordinates, Parameters
 from fitting.quantities import DERIVED, REFERENCE_NM, Quantity, numbers, quantities, spectral_name
 
@@ -99,10 +98,7 @@ def collect(priors: Sequence[Prior], parameters: Parameters) -> Priors | None:
         meant = meant or [number for number, one in enumerate(known) if one.field == name]
         if not meant:
             names = ", ".join(dict.fromkeys(one.field for one in known))
-            close = difflib.get_close_matches(
-                prior.name, [text for one in known for text in (one.field, one.name)], n=1
-            )
-            hint = f", did you mean {close[0]!r}?" if close else ";"
+            hint = did_you_mean(prior.name, [text for one in known for text in (one.field, one.name)]) or ";"
             raise FitError(f"prior: {prior.name!r} does not vary in this fit{hint} numbers that do are of {names}")
         index += meant
         stated += [prior] * len(meant)

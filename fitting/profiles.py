@@ -26,7 +26,7 @@ from jaxtyping import Array, Float
 
 from diffatmo.compiling import outermost
 from diffatmo.numerics import array
-from fitting._errors import FitError
+from fitting._errors import FitError, did_you_mean
 from fitting.evaluation import evaluated, restored
 from fitting.findings import Estimate, Profile
 from fitting.least_squares import known_rows, reduce
@@ -115,8 +115,9 @@ def chosen(estimates: list[Estimate], names: tuple[str, ...]) -> list[Estimate]:
         meant = [e for e in estimates if e.name == name] or [e for e in estimates if e.field == name]
         if not meant:
             known = ", ".join(dict.fromkeys(e.field for e in estimates))
+            hint = did_you_mean(name, [text for e in estimates for text in (e.field, e.name)]) or ";"
             raise FitError(
-                f"profile: {name!r} is no number of this fit; numbers are of {known}, with _<nm> for one wavelength"
+                f"profile: {name!r} is no number of this fit{hint} numbers are of {known}, with _<nm> for one wavelength"
             )
         wanted += [estimate for estimate in meant if estimate not in wanted]
     return wanted

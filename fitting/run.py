@@ -18,7 +18,7 @@ from fitting.evaluation import evaluated
 from fitting.linearisation import Linearisation
 from fitting.parameters import Coordinates
 from fitting.problem import Linear, Problem
-from fitting.search import Point, Progress, Step, minimise
+from fitting.search import Keep, Point, Progress, Step, minimise
 
 
 @dataclass
@@ -59,10 +59,17 @@ class Run:
         return jnp.concatenate([x, linear]), found
 
     def search(
-        self, y: Coordinates, problem: Problem, tolerance: float, *, aside: bool = False, steps: int = 0, **options: Any
+        self,
+        y: Coordinates,
+        problem: Problem,
+        tolerance: float,
+        *,
+        keep: Keep | None = None,
+        steps: int = 0,
+        **options: Any,
     ) -> Point:
-        """A search from ``y`` in up to ``steps`` more; one that is not ``aside`` is what a fit goes on from."""
-        step_size, self.step_size = (None if aside else self.step_size), None
+        """A search from ``y`` in up to ``steps`` more; what a fit goes on from, if no other way to ``keep`` it is given."""
+        step_size, self.step_size = (self.step_size if keep is None else None), None
         return minimise(
             y,
             problem,
@@ -71,7 +78,7 @@ class Run:
             max_steps=len(self.history) + steps if steps else self.max_steps,
             history=self.history,
             progress=self.progress,
-            keep=self.keep_aside if aside else self.keep,
+            keep=keep or self.keep,
             step_size=step_size,
             **options,
         )
@@ -81,12 +88,12 @@ class Run:
         self.best = np.asarray(y), step_size
         self._write()
 
-    def keep_aside(self, y: Coordinates, step_size: float) -> None:
-        """Write how far the search from another start has come, if that is what goes on; it would begin with its own step."""
-        if self.others.underway:
-            ended = self.others.underway[:-1]
-            self.others = self.others._replace(underway=[*ended, np.asarray(y).tolist()])
-            self._write()
+    def keep_aside(self, number: int, y: Coordinates, _: float) -> None:
+        """Write how far the search from another start, of this number, has come; it would go on with a step size of its own."""
+        underway = list(self.others.underway)
+        underway[number:] = [np.asarray(y).tolist(), *underway[number + 1 :]]
+        self.others = self.others._replace(underway=underway)
+        self._write()
 
     def _write(self) -> None:
         """Of several processes, which all come here with the same, one does."""

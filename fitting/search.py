@@ -163,6 +163,9 @@ class Point(NamedTuple):
 Evaluate = Callable[[Coordinates, Linear, Problem], Linearisation]
 """The linearisation at ``x``, with the residuals of these linear nuisances."""
 
+Keep = Callable[[Coordinates, float], None]
+"""What is done with the best point, and the size of the step from there, after every step."""
+
 
 def minimise(
     y: Coordinates,
@@ -173,7 +176,7 @@ def minimise(
     max_steps: int,
     history: list[Step],
     progress: Progress | None,
-    keep: Callable[[Coordinates, float], None],
+    keep: Keep,
     start: Linearisation | None = None,
     step_size: float | None = None,
     patience: int | None = None,
@@ -182,9 +185,8 @@ def minimise(
 ) -> Point:
     """Levenberg-Marquardt from ``y`` until ``history`` holds ``max_steps``; ``start`` is the linearisation there, if known.
 
-    ``keep`` is given the best point and the step size after every step; ``step_size`` is that of the first one.
-    After ``patience`` steps a search that has still gone astray ends. Interrupted before its first point is known, it ends at
-    ``fallback``, if there is one. ``aim`` is for the history.
+    ``step_size`` is that of the first step. After ``patience`` steps a search that has still gone astray ends. Interrupted
+    before its first point is known, it ends at ``fallback``, if there is one. ``aim`` is for the history.
     """
     begun = len(history)
     x, linear = problem.split(y)

@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from numbers import Integral
 from pathlib import Path
 from threading import Thread
 from typing import Any, NamedTuple
@@ -123,8 +124,8 @@ def solve(
         raise FitError(f"model: got {model!r}, expected a model, like diffatmo.models.Moments()")
     if max_steps < 1:
         raise FitError(f"max_steps: got {max_steps}, expected at least 1")
-    if starts is not None and starts < 1:
-        raise FitError(f"starts: got {starts}, expected at least 1")
+    if starts is not None and not (isinstance(starts, Integral) and starts >= 1):
+        raise FitError(f"starts: got {starts!r}, expected at least 1, and a whole number")
     if not 0 < tolerance < math.inf:
         raise FitError(f"tolerance: got {tolerance}, expected a finite number > 0")
     began = time.perf_counter()

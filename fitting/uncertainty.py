@@ -266,8 +266,6 @@ def fit(
     observations = _listed(observations, Observation, "observations", "fitting.observe(...), or a list of them")
     priors = _listed(priors, Prior, "priors", "fitting.Prior(name, value, error), or a list of them")
     free = free if isinstance(free, str) else _listed(free, str, "free", "a list of names of parameters")
-    if not (starts is None or isinstance(starts, int)):
-        raise FitError(f"starts: got {starts!r}, expected a whole number")
     solution = solve(
         observations,
         init=init,

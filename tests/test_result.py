@@ -429,7 +429,7 @@ def test_images_of_something_else_are_refused():
 
 
 def test_a_misspelt_number_is_answered_with_its_like():
-    with pytest.raises(KeyError, match="mie_G: no number of this fit; expected one like mie_g"):
+    with pytest.raises(KeyError, match="'mie_G' is no number of this fit, did you mean 'mie_g'"):
         toy_sky.result().estimate("mie_G")
 
 

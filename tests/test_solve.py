@@ -214,7 +214,7 @@ def test_refuses():
         ({"max_steps": 0}, "max_steps"),
         ({"tolerance": 0.0}, "tolerance"),
         ({"tolerance": float("inf")}, "tolerance: got inf, expected a finite number"),
-        ({"starts": 1.5}, "starts: got 1.5, expected a whole number"),
+        ({"starts": 1.5}, "starts: got 1.5, expected at least 1, and a whole number"),
         ({"observations": images[0].image}, r"observations: got ndarray, expected fitting.observe\(...\)"),
         ({"priors": {"mie_g": 0.7}}, r"priors: got str, expected fitting.Prior\(name, value, error\)"),
         ({"priors": None}, "priors: got NoneType, expected"),

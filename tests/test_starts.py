@@ -1,5 +1,7 @@
 """Starts that are far off, and images that more than one atmosphere explains."""
 
+import json
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -138,6 +140,37 @@ def test_killed_before_its_last_pass_it_goes_on_where_it_was(loss, number, aim, 
         [estimate.value for estimate in found.parameters],
         atol=0.1 * max(estimate.standard_error for estimate in found.parameters),
     )
+
+
+def test_killed_twice_at_its_other_starts_it_knows_both(tmp_path):
+    """The first of two is looked at again after the first kill, which is no reason to forget the second."""
+
+    class Killed(Exception):
+        pass
+
+    aside = []
+
+    def kill(step):
+        if step.aim == "from another start":
+            aside.append(step.stage)
+            # In the second of the searches, then at the first step after that.
+            if len(set(aside)) == 2:
+                raise Killed
+
+    file = tmp_path / "checkpoint.npz"
+    points = []
+    for _ in range(2):
+        with pytest.raises(Killed):
+            twins(0.0, 3, checkpoint=file, progress=kill)
+        with np.load(file) as archive:
+            points.append(json.loads(archive["record"].tobytes())["others"][-1])
+        aside = [0]
+    first, second = (np.ravel(underway) for underway in points)
+    assert len(first) == len(second) == 2
+    assert abs(first[0] - first[1]) > 0.1
+    np.testing.assert_allclose(second, first, atol=0.1)
+    found = twins(0.0, 3, checkpoint=file)
+    assert sorted(minimum.values["mie_g"] for minimum in found.minima) == pytest.approx([-0.5, 0.5], abs=0.01)
 
 
 def test_a_fit_that_does_not_go_astray_costs_nothing_more():
