@@ -4,6 +4,7 @@ BIN := .venv/bin
 READY := .venv/.ready
 # Most of the time of the suite goes to the compiler; see diffatmo/compiling.py.
 COMPILE_FAST := --xla_cpu_use_fusion_emitters=false --xla_cpu_experimental_ynn_fusion_type= --xla_cpu_multi_thread_eigen=false \
+	--xla_disable_hlo_passes=cse_barrier_expander \
 	--xla_backend_optimization_level=1 --xla_backend_extra_options=xla_cpu_disable_loop_unrolling
 
 .PHONY: demo test clean

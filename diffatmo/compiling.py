@@ -16,11 +16,13 @@ _CPU: dict[str, bool | int | str] = {
     "xla_cpu_use_fusion_emitters": False,
     "xla_cpu_experimental_ynn_fusion_type": "",
     "xla_cpu_multi_thread_eigen": False,
+    "xla_disable_hlo_passes": "cse_barrier_expander",
 }
 """XLA's older emitters of loops: the newer ones take twice as long to compile programs of many small formulas, as the models
 are, and make them 10 % faster. And no library for products and sums: the models' are too small for it to pay its way, and
 without it they run a third faster. And each product on one thread: they are thousands of a few microseconds, which take twice
-as long shared out; loops are shared out all the same."""
+as long shared out; loops are shared out all the same. And barriers stay until loops are merged, see
+:func:`diffatmo.numerics.once`."""
 
 _CPU_FEW_CALLS = _CPU | {"xla_backend_optimization_level": 1}
 """Another 15 % off the time to compile, for up to half as much again to run."""

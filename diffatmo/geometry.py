@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from diffatmo._types import Altitude, Cosine, Length, Scalar
-from diffatmo.numerics import bounded_divide, safe_sqrt
+from diffatmo.numerics import bounded_divide, once, safe_sqrt
 
 
 def sine(mu: Cosine) -> Cosine:
@@ -102,10 +102,11 @@ def enter_atmosphere(
     mu_s_there = jnp.where(outside, (r * mu_s + distance * nu) / r_there, mu_s)
     altitude_there = jnp.where(outside, top_altitude, altitude)
     # A miss is parked on a harmless ray of length zero, so that nothing downstream meets an undefined geometry.
-    return (
+    moved = (
         altitude_there,
         jnp.where(misses, 1.0, jnp.clip(mu_there, -1, 1)),
         jnp.where(misses, mu_s, jnp.clip(mu_s_there, -1, 1)),
         distance,
         misses,
     )
+    return once(moved)

@@ -51,6 +51,18 @@ def whole_products(function: Callable[P, T]) -> Callable[P, T]:
     return exact
 
 
+def once(value: T) -> T:
+    """``value``, whose arrays are computed once and kept.
+
+    XLA repeats cheap formulas in every loop that uses what comes of them: more than half of a model's operations were such
+    copies. The barrier forbids it, for values and derivatives alike, where the compiler is told not to take it down before it
+    merges loops, as :func:`diffatmo.compiler_options` does.
+    """
+    # One barrier for each array: those that do not change with what is differentiated would else be given derivatives.
+    kept: T = jax.tree.map(jax.lax.optimization_barrier, value)
+    return kept
+
+
 def safe_sqrt(x: Float[Array, "..."]) -> Float[Array, "..."]:
     """sqrt(x) for x > 0 and 0 otherwise; the derivative is 0 where x <= 0."""
     x = jnp.asarray(x)

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float
 
 from diffatmo import geometry
 from diffatmo._types import Altitude, Cosine, Length, Scalar
-from diffatmo.numerics import bounded_divide, gauss_legendre, safe_divide, safe_sqrt
+from diffatmo.numerics import bounded_divide, gauss_legendre, once, safe_divide, safe_sqrt
 
 STRETCH = 0.15
 """Stretch of the altitude map as a fraction of the atmosphere's thickness: 15 km on Earth, above every scale height."""
@@ -96,7 +96,7 @@ def shadow_crossings(altitude: Altitude, mu: Cosine, mu_s: Cosine, nu: Cosine, r
         distance = safe_divide(sign * root - b, a, -1.0)
         behind = (discriminant > 0) & (r * mu_s + distance * nu < 0)
         crossings.append(jnp.where(behind, distance, -1.0))
-    return crossings[0], crossings[1]
+    return once((crossings[0], crossings[1]))
 
 
 def trace(
@@ -172,14 +172,16 @@ def place(
         pieces.append((jnp.where(ascending, low, between), jnp.where(ascending, between, high), sign))
         pieces.append((jnp.where(ascending, between, low), jnp.where(ascending, high, between), sign))
 
-    low, high, sign = (jnp.stack(parts, axis=-1) for parts in zip(*pieces, strict=True))
-    v_bottom, bottom = v_bottom[..., None], bottom[..., None]
+    low, high, sign = once(tuple(jnp.stack(parts, axis=-1) for parts in zip(*pieces, strict=True)))
+    v_bottom, bottom, perigee, r_mu = once(
+        (v_bottom[..., None], bottom[..., None], perigee[..., None], r_mu[..., None])
+    )
     rise = jnp.maximum(low - bottom, 0)
-    v_low = v_bottom + bounded_divide(rise, v_bottom + safe_sqrt(v_bottom * v_bottom + rise))
+    v_low = once(v_bottom + bounded_divide(rise, v_bottom + safe_sqrt(v_bottom * v_bottom + rise)))
     position = jnp.where(sign[..., None] > 0, s, 1 - s)
-    h, z, slope = _piece(low, high, v_low, perigee[..., None], radius, stretch[..., None, None], position)
-    distance = jnp.maximum(sign[..., None] * z - r_mu[..., None, None], 0)
-    return Nodes(h, distance, slope * w)
+    h, z, slope = _piece(low, high, v_low, perigee, radius, stretch[..., None, None], position)
+    distance = jnp.maximum(sign[..., None] * z - r_mu[..., None], 0)
+    return once(Nodes(h, distance, slope * w))
 
 
 def straight(altitude: Altitude, mu: Cosine, length: Length, radius: Scalar, steps: int) -> Nodes:

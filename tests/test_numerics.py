@@ -36,6 +36,18 @@ def test_values_agree_with_numpy_where_it_has_one():
     np.testing.assert_allclose(numerics.safe_arccos(x), np.arccos(x), rtol=1e-5)
 
 
+def test_what_is_computed_once_is_what_it_was():
+    """Value and derivatives, of each array by what it depends on only: the others have none."""
+    function = lambda x: {"moving": jnp.sin(x), "still": jnp.cos(2.0 * jnp.ones(3)), "index": jnp.arange(3)}
+    of = lambda keep, x: (keep(function(x))["moving"] * keep(function(x))["still"]).sum()
+    x = jnp.linspace(0, 1, 3)
+    for derivative in (jax.grad, jax.jacfwd, jax.hessian):
+        expected = jax.vmap(derivative(lambda x: of(lambda y: y, x)))(x[:, None])
+        np.testing.assert_array_equal(jax.vmap(derivative(lambda x: of(numerics.once, x)))(x[:, None]), expected)
+    tangents = jax.make_jaxpr(lambda x: jax.jvp(lambda x: numerics.once(function(x)), (x,), (x,)))(x)
+    assert sum(eqn.primitive.name == "optimization_barrier" for eqn in tangents.eqns) == 4
+
+
 @pytest.mark.parametrize(("dtype", "bound"), [(np.float32, 6e-7), (np.float64, 1e-14)])
 def test_arcsinh_is_numpys_and_so_is_its_slope(x64, dtype, bound):
     """To three roundings of values up to 3; 0 is a point like any other."""

@@ -27,7 +27,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from diffatmo import geometry
 from diffatmo._types import Altitude, Cosine, Length, Scalar
-from diffatmo.numerics import safe_divide, safe_sqrt
+from diffatmo.numerics import once, safe_divide, safe_sqrt
 
 PARAMETERISATIONS = ("2017", "2008")
 
@@ -237,13 +237,13 @@ def _unit(count: int) -> Float[Array, " n"]:
 
 
 def _position(x: Float[Array, "..."], count: int) -> Float[Array, "..."]:
-    return jnp.clip(x, 0, 1) * (count - 1)
+    return once(jnp.clip(x, 0, 1) * (count - 1))
 
 
 def taps(position: Float[Array, "..."], count: int) -> tuple[Int[Array, "..."], Float[Array, "..."]]:
     """The entry before a position, and how far it is to the next one."""
     first = jnp.clip(jnp.floor(position).astype(jnp.int32), 0, count - 2)
-    return first, position - first
+    return once((first, position - first))
 
 
 def _linear(table: Float[Array, "nx *c"], x: Float[Array, "..."]) -> Float[Array, "..."]:

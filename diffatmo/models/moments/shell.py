@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 from diffatmo import geometry, rays, table
 from diffatmo._types import Altitude, Cosine, Scalar
 from diffatmo.models.moments.angular import cosines, orders, pairs, plane, polar, projection, relative_nu
-from diffatmo.numerics import arcsinh, gauss_legendre, safe_divide
+from diffatmo.numerics import arcsinh, gauss_legendre, once, safe_divide
 from diffatmo.rays import Nodes
 
 ALTITUDE_LINEAR = 0.04
@@ -132,7 +132,7 @@ def altitude_unit(altitude: Altitude, top: Altitude) -> Float[Array, "..."]:
 def sun_unit(mu_s: Cosine, radius: Scalar, top: Altitude) -> Float[Array, "..."]:
     """Unit coordinate of a sun height; not below 0, where the sky is dark."""
     low, high = sun_range(radius, top)
-    return jnp.maximum((arcsinh(mu_s / grazing(radius, top)) - low) / (high - low), 0)
+    return once(jnp.maximum((arcsinh(mu_s / grazing(radius, top)) - low) / (high - low), 0))
 
 
 def dusk(mu_s: Cosine, scale: Scalar) -> Float[Array, "..."]:
@@ -169,7 +169,7 @@ class _Bundle(NamedTuple):
         horizon = geometry.horizon_mu(altitude, radius)[:, None]
         span = jnp.where(ground, -1, 1) - horizon
         slope = DIRECTION_LINEAR + 2 * (1 - DIRECTION_LINEAR) * unit
-        mu = horizon + span * table.stretch(unit, DIRECTION_LINEAR)
+        mu, span = once((horizon + span * table.stretch(unit, DIRECTION_LINEAR), span))
         places = np.zeros((2, len(ground), 1, max(count.steps for count in counts)), dtype)
         for count, rows in zip(counts, _parts(counts), strict=True):
             places[:, rows, :, : count.steps] = np.stack(rays.rule(count.steps, dtype.name)[:2])[:, None, None]
@@ -287,19 +287,19 @@ def build(
     source_degree: int,
 ) -> Shell:
     """All geometry of a planet (radii and altitudes in km)."""
-    altitude = top_altitude * table.stretch(jnp.linspace(0, 1, altitudes), ALTITUDE_LINEAR)
+    altitude = once(top_altitude * table.stretch(jnp.linspace(0, 1, altitudes), ALTITUDE_LINEAR))
     low, high = sun_range(bottom_radius, top_altitude)
     scale = grazing(bottom_radius, top_altitude)
-    mu_s = scale * jnp.sinh(jnp.linspace(0, 1, suns) * (high - low) + low)
+    mu_s = once(scale * jnp.sinh(jnp.linspace(0, 1, suns) * (high - low) + low))
     counts = first, iterate, last
     bundle = _Bundle.trace(altitude, bottom_radius, top_altitude, counts)
-    once, *sets = _rays(altitude, mu_s, bottom_radius, bundle, counts)
+    first_rays, *sets = _rays(altitude, mu_s, bottom_radius, bundle, counts)
     again, finally_ = _links(altitude, mu_s, bottom_radius, top_altitude, bundle, sets, (iterate.degree, source_degree))
     return Shell(
         altitude=altitude,
         mu_s=mu_s,
         dusk=dusk(mu_s, scale),
-        first=once,
+        first=first_rays,
         iterate=again,
         last=finally_,
         bottom_radius=bottom_radius,

@@ -14,7 +14,7 @@ from diffatmo.models.base import Path, Ray, Sky, View
 from diffatmo.models.moments.angular import azimuthal, degrees, orders, plane, polar
 from diffatmo.models.moments.shell import Shell, Ways, dusk
 from diffatmo.models.moments.solve import Degrees, State, gather, source_moments
-from diffatmo.numerics import safe_divide, safe_sqrt, whole_products
+from diffatmo.numerics import once, safe_divide, safe_sqrt, whole_products
 
 ZENITH_WIDTH = 0.02
 """Least half-width of the range of nu that is tabulated, where view or sun is at the zenith, and azimuth has no meaning."""
@@ -148,11 +148,11 @@ class _Rows(eqx.Module):
         distance = self.nadir_distance + (self.horizon_distance - self.nadir_distance) * out
         r, h = radius + self.altitude, self.altitude
         ground = -safe_divide(h * (h + 2 * radius) + distance * distance, 2 * r * distance, 1.0)
-        return jnp.concatenate([sky, jnp.clip(ground, -1, self.horizon)])
+        return once(jnp.concatenate([sky, jnp.clip(ground, -1, self.horizon)]))
 
     def half_width(self, mu: Cosine, mu_s: Cosine) -> Cosine:
         """Half-width of the range of nu tabulated at ``mu``: sinθ sinθ_s, kept from vanishing."""
-        return safe_sqrt((1 - mu * mu) * (1 - mu_s * mu_s) + self.widening * self.widening)
+        return once(safe_sqrt((1 - mu * mu) * (1 - mu_s * mu_s) + self.widening * self.widening))
 
     def locate(self, mu: Cosine, ground: Bool[Array, "..."], radius: Scalar) -> tuple[Int[Array, "..."], Array]:
         """First row and four weights for interpolation at ``mu``; the two parts of the table do not mix."""
