@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from diffatmo._types import Cosine, Scalar
-from diffatmo.numerics import gauss_legendre, once, safe_divide, safe_sqrt
+from diffatmo.numerics import gauss_legendre, safe_divide, safe_sqrt
 
 MiePhase = Literal["henyey-greenstein", "cornette-shanks"]
 MIE_PHASES: tuple[str, ...] = get_args(MiePhase)
@@ -136,7 +136,7 @@ def _powers(g: Scalar, degree: int) -> Float[Array, " l"]:
     powers = [jnp.ones_like(g)]
     for _ in range(degree):
         powers.append(powers[-1] * g)
-    return once(jnp.stack(powers))
+    return jnp.stack(powers)
 
 
 def mie_moments(g: Scalar, degree: int, name: Shape) -> Float[Array, " l"]:

@@ -31,7 +31,6 @@ from jaxtyping import Array, Float, Int
 
 from diffatmo.atmosphere import Atmosphere
 from diffatmo.models import Sky
-from diffatmo.numerics import once
 from fitting.batch import PIXEL_FIELDS, Views
 from fitting.correction import apply
 from fitting.nuisances import AEROSOL, SHADING
@@ -183,7 +182,7 @@ def visit(
     coordinates, moved = problem.parts(x)
     colour, _ = problem.colours()
     seeds = jnp.asarray(colour == np.arange(colour.max() + 1)[:, None], dtype=coordinates.dtype)
-    air, of_air = once(_push(problem.parameters.atmosphere, (coordinates,), (seeds,)))
+    air, of_air = _push(problem.parameters.atmosphere, (coordinates,), (seeds,))
     # What moves the view comes first among the offsets, shading next, and last a free aerosol.
     apart = AEROSOL in batch.nuisances.moving
     turning = sum(component < SHADING.start for component in batch.nuisances.moving)

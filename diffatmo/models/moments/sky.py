@@ -148,7 +148,7 @@ class _Rows(eqx.Module):
         distance = self.nadir_distance + (self.horizon_distance - self.nadir_distance) * out
         r, h = radius + self.altitude, self.altitude
         ground = -safe_divide(h * (h + 2 * radius) + distance * distance, 2 * r * distance, 1.0)
-        return once(jnp.concatenate([sky, jnp.clip(ground, -1, self.horizon)]))
+        return jnp.concatenate([sky, jnp.clip(ground, -1, self.horizon)])
 
     def half_width(self, mu: Cosine, mu_s: Cosine) -> Cosine:
         """Half-width of the range of nu tabulated at ``mu``: sinθ sinθ_s, kept from vanishing."""

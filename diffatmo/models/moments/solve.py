@@ -18,7 +18,7 @@ from diffatmo._types import Altitude, Scalar
 from diffatmo.atmosphere import Atmosphere
 from diffatmo.models.moments.angular import azimuthal, cosines, degrees, orders, pairs, relative_nu
 from diffatmo.models.moments.shell import Links, Rays, Shell, Ways
-from diffatmo.numerics import once, per_parameter, tiny
+from diffatmo.numerics import per_parameter, tiny
 from diffatmo.rays import PIECES, Nodes
 
 
@@ -253,7 +253,7 @@ def source_moments(
     moments = phase.mie_moments(atmosphere.mie_g, degree, atmosphere.mie_phase) - peak
     aerosol = moments[:, None] * atmosphere.mie_scattering
     densities = transmittance.exponentials(transmittance.scale_heights(atmosphere), altitude)[..., None, None]
-    return once(densities[0] * air + densities[1] * aerosol)
+    return densities[0] * air + densities[1] * aerosol
 
 
 def _add(a: State, b: State) -> State:
