@@ -33,7 +33,8 @@ def _known(options: dict[str, bool | int | str]) -> dict[str, bool | int | str]:
     if jax.default_backend() != "cpu":
         return {}
     try:
-        jax.jit(lambda: 0, compiler_options=options)()
+        # With a barrier: this compiler has to know what to do with one that stays.
+        jax.jit(jax.lax.optimization_barrier, compiler_options=options)(0.0)
     except jax.errors.JaxRuntimeError:
         return {}
     return dict(options)

@@ -102,11 +102,11 @@ def enter_atmosphere(
     mu_s_there = jnp.where(outside, (r * mu_s + distance * nu) / r_there, mu_s)
     altitude_there = jnp.where(outside, top_altitude, altitude)
     # A miss is parked on a harmless ray of length zero, so that nothing downstream meets an undefined geometry.
-    moved = (
+    there = (
         altitude_there,
         jnp.where(misses, 1.0, jnp.clip(mu_there, -1, 1)),
         jnp.where(misses, mu_s, jnp.clip(mu_s_there, -1, 1)),
         distance,
         misses,
     )
-    return once(moved)
+    return once(there)
