@@ -33,7 +33,10 @@ def check_free(directory: Path, *, names: Sequence[str], prefixes: Sequence[str]
         return
     present = sorted(f.name for f in directory.iterdir() if f.name in names or f.name.startswith(tuple(prefixes)))
     if present:
-        raise FolderError(f"{directory}: holds results already ({present[0]}); choose another folder, or --overwrite")
+        raise FolderError(
+            f"{directory}: holds results already ({present[0]}); choose another folder, or overwrite them (--overwrite, in "
+            "Python overwrite=True)"
+        )
 
 
 def prepare(directory: Path, *, names: Sequence[str], prefixes: Sequence[str] = (), overwrite: bool = False) -> None:

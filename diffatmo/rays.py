@@ -72,7 +72,8 @@ def _piece(
     k = bounded_divide(span, v + end)
     risen = k * s * (2 * v + k * s)
     shrink = 1 - risen / stretch
-    climb = -stretch * jnp.log(shrink)
+    # Not log(shrink): of small climbs it is a rounding error, by which v_here may be far from v + k s.
+    climb = -stretch * jnp.log1p(-risen / stretch)
     altitude = lower + climb
     v_here = safe_sqrt(v * v + climb)
     root = jnp.sqrt(altitude + perigee + 2 * radius)
@@ -176,7 +177,8 @@ def place(
     v_bottom, bottom, perigee, r_mu = once(
         (v_bottom[..., None], bottom[..., None], perigee[..., None], r_mu[..., None])
     )
-    rise = jnp.maximum(low - bottom, 0)
+    # With no derivative where it is 0: of a ray that starts all but horizontally it would be 1 / v, and drown all others.
+    rise = jnp.where(low > bottom, low - bottom, 0)
     v_low = once(v_bottom + bounded_divide(rise, v_bottom + safe_sqrt(v_bottom * v_bottom + rise)))
     position = jnp.where(sign[..., None] > 0, s, 1 - s)
     h, z, slope = _piece(low, high, v_low, perigee, radius, stretch[..., None, None], position)

@@ -78,7 +78,8 @@ def _rising(
     """
     m = v / jnp.sqrt(scale_height)
     effective = altitude + scale_height * (1 - 0.5 / (1 + m * (2 / math.sqrt(math.pi) + m)))
-    factor = (radius + effective) / jnp.sqrt(effective + perigee + 2 * radius)
+    # At least R; half of it where rounding, far off a small planet, has put the perigee beyond the centre.
+    factor = (radius + effective) / jnp.sqrt(jnp.maximum(effective + perigee + 2 * radius, radius / 2))
     return scaled_erfcx(m, -altitude / scale_height) * factor
 
 
@@ -111,8 +112,8 @@ def ramp_columns(
     length, depth = high - low, a - perigee
     for position, weight in zip(t, w, strict=True):
         z_squared = (low + length * position) ** 2
-        # Less the height above the perigee.
-        depth = depth - weight * z_squared / (jnp.sqrt(squared + z_squared) + from_center)
+        # Less the height above the perigee. Far off a small planet, rounding may put that well beyond the centre.
+        depth = depth - weight * z_squared / jnp.maximum(jnp.sqrt(squared + z_squared) + from_center, 1e-6)
     return length * depth
 
 

@@ -131,29 +131,30 @@ def stack(observations: Sequence[Observation], wavelengths: Sequence[float], mes
     # Among several devices, some would have nothing but what is added.
     size = devices * tiles * (rounded(each) if devices == 1 else each)
 
-    def padded(field: str | Sequence[np.ndarray], fill: Any) -> Array:
+    def padded(field: str | Sequence[np.ndarray], fill: Any) -> np.ndarray:
         values = [getattr(o, field) for o in observations] if isinstance(field, str) else field
         rows = np.full((len(observations), size, *values[0].shape[2:]), fill, values[0].dtype)
         for row, value, observation in zip(rows, values, observations, strict=True):
             row[: observation.shown.sum()] = value[observation.shown]
-        return number(rows)
+        return rows
 
     def noise(field: str, fill: float) -> Array:
         values = [getattr(observation, field) for observation in observations]
         if all(np.all(value == value[:1, :1]) for value in values):
             return number(np.stack([value[0, :1] for value in values]))
-        return padded(field, np.float32(fill))
+        return number(padded(field, np.float32(fill)))
 
     def number(value: Any) -> Array:
         value = np.asarray(value)
         return array(value, bool if value.dtype == bool else None)
 
+    # On NumPy's arrays: of JAX's, every operation would compile a program for every shape.
     directions = padded("directions", np.array([0, 0, 1], dtype=np.float32))[..., None, :]
     if any(observation.block > 1 for observation in observations):
-        first, second = jnp.moveaxis(padded("spread", np.float32(0)), -2, 0)[..., None, :]
-        signs = array([[1, 1], [1, -1], [-1, 1], [-1, -1]], first.dtype)[..., None]
+        first, second = np.moveaxis(padded("spread", np.float32(0)), -2, 0)[..., None, :]
+        signs = np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]], first.dtype)[..., None]
         directions = directions + signs[:, 0] * first + signs[:, 1] * second
-        directions = directions / jnp.linalg.norm(directions, axis=-1, keepdims=True)
+        directions = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
     seeing = [observation.bands.response for observation in observations if observation.bands is not None]
     nuisances = gather(observations, wavelengths)[1]
     components = [OFFSETS[n] for n in nuisances.moving if SHADING.start <= n < SHADING.stop]
@@ -167,14 +168,14 @@ def stack(observations: Sequence[Observation], wavelengths: Sequence[float], mes
     return Batch(
         altitude=number([observation.altitude for observation in observations]),
         sun=number(np.stack([observation.sun for observation in observations])),
-        directions=directions,
+        directions=number(directions),
         # Pixels that are not finite are shown and counted but never used (fitting.observation); 0 * NaN would be NaN.
-        measured=jnp.nan_to_num(padded("image", np.float32(0)), posinf=0.0, neginf=0.0),
-        used=padded("used", False),
+        measured=number(np.nan_to_num(padded("image", np.float32(0)), posinf=0.0, neginf=0.0)),
+        used=number(padded("used", False)),
         noise=noise("noise", 0.0),
         noise_shot=noise("noise_shot", 0.0),
         noise_floor=noise("noise_floor", 1.0),
-        shading=padded(shaded, np.float32(0)),
+        shading=number(padded(shaded, np.float32(0))),
         exposure_value=number([observation.exposure_value for observation in observations]),
         nuisances=nuisances,
         sun_axes=number(np.stack([sun_axes(observation.sun) for observation in observations])),

@@ -53,6 +53,11 @@ class Bijection(eqx.Module):
         """The smallest and largest coordinate, where the value is as good as at its bound."""
 
 
+def _ends(like: Numbers, reach: float) -> tuple[Numbers, Numbers]:
+    ends = np.full(like.shape, reach, like.dtype)
+    return -ends, ends
+
+
 class Log(Bijection):
     """value = lower + unit exp(y), within a factor e^±REACH of ``unit``."""
 
@@ -72,7 +77,7 @@ class Log(Bijection):
     @property
     def limits(self):
         """See :class:`Bijection`."""
-        return jnp.full_like(self.unit, -self.REACH), jnp.full_like(self.unit, self.REACH)
+        return _ends(self.unit, self.REACH)
 
 
 class Logit(Bijection):
@@ -95,7 +100,7 @@ class Logit(Bijection):
     @property
     def limits(self):
         """See :class:`Bijection`."""
-        return jnp.full_like(self.lower, -self.REACH), jnp.full_like(self.lower, self.REACH)
+        return _ends(self.lower, self.REACH)
 
 
 class Linear(Bijection):

@@ -13,7 +13,10 @@ error bars.
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
+
+from diffatmo.numerics import array
 
 DIRECTIONS = 3
 """Along which the ratio may change: as many as there are places for, since other shapes would be compiled anew."""
@@ -33,8 +36,8 @@ class Correction(eqx.Module):
     @classmethod
     def constant(cls, ratio: Ratio, at: Float[Array, " x"]) -> "Correction":
         """The same ratio everywhere."""
-        none = jnp.zeros((*ratio.shape, DIRECTIONS), ratio.dtype)
-        return cls(ratio, at, none, jnp.zeros((DIRECTIONS, at.size), at.dtype))
+        none = array(np.zeros((*ratio.shape, DIRECTIONS)), ratio.dtype)
+        return cls(ratio, at, none, array(np.zeros((DIRECTIONS, at.size)), at.dtype))
 
     def steps(self, x: Float[Array, " x"]) -> Float[Array, " k"]:
         """How far ``x`` is along each direction."""

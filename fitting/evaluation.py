@@ -23,7 +23,7 @@ from fitting.linearisation import Linearisation, linearise
 from fitting.observation import Observation, light_of
 from fitting.parameters import Coordinates, Parameters
 from fitting.priors import Prior, collect
-from fitting.problem import Linear, Predicted, Problem, light, lit_weights, planet_shell, weights, whitened
+from fitting.problem import Linear, Predicted, Problem, light, limits_of, lit_weights, planet_shell, weights, whitened
 from fitting.robust import Loss, scale
 from fitting.smooth import Fields
 
@@ -66,7 +66,7 @@ def pose(
     problem = Problem(model, parameters, batch, weight, shell, priors=known, loss=robust, fields=fields)
     if finer is None:
         return problem
-    return replace(problem, correction=Correction.constant(jnp.ones_like(signal), problem.start))
+    return replace(problem, correction=Correction.constant(array(np.ones(signal.shape), signal.dtype), problem.start))
 
 
 def measured_light(batch: Batch) -> Float[np.ndarray, "image pixel w"]:
@@ -111,42 +111,38 @@ def corrected(
     """
     x, linear = problem.split(y)
     here = _ratio(x, found.radiance, problem, finer)
-    ratio = jnp.where(jnp.isfinite(here), here, 1)
+    ratio = array(np.where(np.isfinite(here), here, 1), here.dtype)
     if near is not None:
         return replace(problem, correction=replace(near, ratio=ratio, at=x))
-    correction, place = Correction.constant(ratio, x), 0
-    added = _added(y, found.radiance, problem, ratio - 1)
+    slopes = np.zeros((*here.shape, DIRECTIONS), here.dtype)
+    along, place = np.zeros((DIRECTIONS, x.size)), 0
+    added = _added(y, found.radiance, problem, np.asarray(ratio) - 1)
     for step, seen in _open_steps(y, found, problem)[:TRIED]:
         if place == DIRECTIONS or CHANGE * added * np.linalg.norm(step) < NEGLIGIBLE:
             break
         there = array(np.asarray(x, dtype=np.float64) + step, x.dtype)
         shifted = evaluate(there, linear, problem)
-        slope = jnp.log(_ratio(there, shifted.radiance, problem, finer) / here)
-        lost = np.asarray(jnp.isfinite(here) & ~jnp.isfinite(slope) & problem.batch.used[..., None])
+        slope = np.log(_ratio(there, shifted.radiance, problem, finer) / here)
+        lost = np.isfinite(here) & ~np.isfinite(slope) & np.asarray(problem.batch.used)[..., None]
         if np.asarray(shifted.bad).any() or lost.any():
             continue
-        slope = jnp.where(jnp.isfinite(slope), slope, 0)
+        slope = np.where(np.isfinite(slope), slope, 0)
         if _added(y, found.radiance, problem, slope) < SLIGHT * seen:
             continue
-        along = array(step / (step @ step), x.dtype)
-        correction = replace(
-            correction,
-            slope=correction.slope.at[..., place].set(slope),
-            along=correction.along.at[place].set(along),
-        )
+        slopes[..., place], along[place] = slope, step / (step @ step)
         place += 1
-    return replace(problem, correction=correction)
+    return replace(problem, correction=Correction(ratio, x, array(slopes, here.dtype), array(along, x.dtype)))
 
 
-def _ratio(x: Coordinates, radiance: Predicted, problem: Problem, finer: Model) -> Predicted:
+def _ratio(x: Coordinates, radiance: Predicted, problem: Problem, finer: Model) -> Float[np.ndarray, "image pixel w"]:
     found = outermost(model_error.ratio)(x, placed(problem), radiance, finer)
-    return gathered(jax.block_until_ready(found), problem.batch.mesh)
+    return np.asarray(gathered(jax.block_until_ready(found), problem.batch.mesh))
 
 
-def _added(y: Coordinates, radiance: Predicted, problem: Problem, part: Predicted) -> float:
+def _added(y: Coordinates, radiance: Predicted, problem: Problem, part: Float[np.ndarray, "image pixel w"]) -> float:
     """Such a part of the light, in units of the noise, over all pixels."""
-    lit = outermost(light)(y, radiance, problem)
-    return float(np.linalg.norm(np.asarray(lit * problem.weight * part, dtype=np.float64)))
+    lit = np.asarray(outermost(light)(y, radiance, problem), dtype=np.float64)
+    return float(np.linalg.norm(lit * np.asarray(problem.weight) * part))
 
 
 def _open_steps(y: Coordinates, found: Linearisation, problem: Problem) -> list[tuple[Float[np.ndarray, " x"], float]]:
@@ -160,7 +156,7 @@ def _open_steps(y: Coordinates, found: Linearisation, problem: Problem) -> list[
     if of_linear.size:
         of_x = of_x - of_linear @ np.linalg.lstsq(of_linear, of_x)[0]
     _, singular, directions = np.linalg.svd(of_x)
-    lower, upper = (np.asarray(limit, dtype=np.float64) for limit in problem.limits)
+    lower, upper = (np.asarray(limit, dtype=np.float64) for limit in outermost(limits_of)(problem))
     x = np.asarray(y[: problem.size], dtype=np.float64)
     steps = []
     for value, direction in zip(singular[::-1], directions[::-1], strict=True):

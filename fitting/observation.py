@@ -12,6 +12,7 @@ the mean radiance by about (block width)² / 24 times the second derivative, whi
 horizon only.
 """
 
+import difflib
 import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple, Protocol
@@ -232,12 +233,9 @@ def observe(
     )
     refuse.unless(saturation is None or saturation > 0, "saturation", saturation, "a number > 0")
     refuse.unless(max_pixels >= 1, "max_pixels", max_pixels, "at least 1")
-    for key, value in (("exposure", exposure), ("pedestal", pedestal)):
-        known = ", a number that is known is exposure_value" if key == "exposure" else ""
-        refuse.unless(isinstance(value, str), key, repr(value), f'"fixed", "free" or a name{known}')
-        named = value.removesuffix(PER_CHANNEL) and value != FIXED + PER_CHANNEL
-        refuse.unless(bool(named), key, repr(value), '"fixed", "free" or a name')
     for key, value in (
+        ("exposure", exposure),
+        ("pedestal", pedestal),
         ("white_balance", white_balance),
         ("sun_offset", sun_offset),
         ("pose", pose),
@@ -247,7 +245,7 @@ def observe(
         ("chroma", chroma),
         ("aerosol", aerosol),
     ):
-        refuse.unless(bool(value), key, repr(value), '"fixed", "free" or a name')
+        _check_choice(refuse, key, value)
     for key, error in (
         ("sun_offset_error", sun_offset_error),
         ("pose_error", pose_error),
@@ -361,6 +359,18 @@ class _Refusal(NamedTuple):
     def unless(self, good: bool, key: str, value: Any, expected: str) -> None:
         if not good:
             self(f"{key}: got {value}, expected {expected}")
+
+
+def _check_choice(refuse: _Refusal, key: str, value: Any) -> None:
+    """Refuse what is no choice, and what is nearly ``fixed`` or ``free``: misspelt, it would be the name of a group."""
+    expected = '"fixed", "free" or a name' + ", a number that is known is exposure_value" * (key == "exposure")
+    refuse.unless(isinstance(value, str) and value != FIXED + PER_CHANNEL, key, repr(value), expected)
+    name = value.removesuffix(PER_CHANNEL)
+    alike = name == value or key in ("exposure", "pedestal")
+    refuse.unless(bool(name) and alike and not name.endswith(PER_CHANNEL), key, repr(value), expected)
+    near = difflib.get_close_matches(name.lower(), (FIXED, FREE), n=1, cutoff=0.8)
+    if near and name not in near:
+        refuse(f"{key}: got {value!r}, did you mean {near[0]!r}? As the name of a group it is too much like it")
 
 
 def _per_pixel(refuse: _Refusal, key: str, value: float | np.ndarray, shape: tuple[int, ...]) -> np.ndarray:

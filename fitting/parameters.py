@@ -31,7 +31,7 @@ from jaxtyping import Array, Bool, Float, Int
 from diffatmo import spectrum
 from diffatmo.atmosphere import SPECTRAL, Atmosphere
 from diffatmo.compiling import outermost
-from diffatmo.numerics import array, safe_divide
+from diffatmo.numerics import array
 from diffatmo.phase import PhaseTable
 from fitting._errors import FitError, did_you_mean
 from fitting.bijections import Bijection, Linear, Log, Logit
@@ -146,19 +146,20 @@ class Aerosol(Block):
     @classmethod
     def build(cls, init: Atmosphere, absorption: bool) -> "Aerosol":
         """Start from the power law nearest to the aerosol of ``init``; ``absorption`` says whether the last is free."""
-        ratio = init.wavelengths / REFERENCE_NM
-        if not bool(jnp.all(init.mie_extinction > 0)):
+        scattered, absorbed, wavelengths = map(np.asarray, (init.mie_scattering, init.mie_absorption, init.wavelengths))
+        extinction, ratio = scattered + absorbed, wavelengths / np.asarray(REFERENCE_NM, wavelengths.dtype)
+        if not np.all(extinction > 0):
             raise FitError(f"tie: {MIE} = {ANGSTROM!r} needs an aerosol to start from, but the start has none")
-        depth, x = np.log(np.asarray(init.mie_extinction, float)), np.log(np.asarray(ratio, float))
+        depth, x = np.log(extinction.astype(float)), np.log(ratio.astype(float))
         slope, level = np.polyfit(x, depth, 1) if x.size > 1 else (0.0, depth.mean())
-        absorbed = safe_divide(init.mie_absorption, init.mie_extinction)
+        part = absorbed / extinction
         alpha = float(np.clip(-slope, cls.LIMITS[0][1], cls.LIMITS[1][1]))
-        start = [0.0, alpha, *[float(absorbed.mean()) / cls.ABSORBED] * absorption]
-        dtype = init.mie_extinction.dtype
+        start = [0.0, alpha, *[float(part.mean()) / cls.ABSORBED] * absorption]
+        dtype = extinction.dtype
         return cls(
             extinction=array(np.exp(level), dtype),
-            absorbed=None if absorption else absorbed,
-            ratio=ratio,
+            absorbed=None if absorption else array(part, dtype),
+            ratio=array(ratio, dtype),
             start=array(start, dtype),
         )
 

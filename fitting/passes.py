@@ -37,7 +37,7 @@ from fitting.least_squares import reduce_images
 from fitting.linearisation import Linearisation
 from fitting.mixing import mixed
 from fitting.parameters import Coordinates
-from fitting.problem import Problem, whitened
+from fitting.problem import Problem, limits_of, whitened
 from fitting.run import Run
 from fitting.search import ASTRAY, FIRST_PASS_TOLERANCE, INTERRUPTED, Point, count
 from fitting.starts import APART, RIVAL, ranked, separation
@@ -183,7 +183,7 @@ def refined(run: Run, found: Found, finer: Model) -> tuple[Found, Float[np.ndarr
                 break
             here = array(mixed(places, images, metric), best.y.dtype)
             x, linear = problem.split(here)
-            here = jnp.concatenate([jnp.clip(x, *problem.limits), linear])
+            here = jnp.concatenate([jnp.clip(x, *outermost(limits_of)(problem)), linear])
             linearisation = run.evaluate(*problem.split(here), alone)
             on = here
         else:

@@ -47,7 +47,7 @@ from fitting.nuisances import gather
 from fitting.observation import FIXED, NOISE, PER_CHANNEL, Observation, observe, sigma
 from fitting.parameters import Coordinates, Parameters, select
 from fitting.priors import Prior, Priors, collect
-from fitting.problem import Problem, light, planet_shell, weights
+from fitting.problem import Problem, lit_weights, planet_shell
 from fitting.quantities import DERIVED, Quantity, numbers, quantities
 from fitting.uncertainty import propagate
 
@@ -238,7 +238,7 @@ def of_observations(observations: Sequence[Observation], parameters: Parameters,
     check_finite(np.asarray(found.bad), [observation.name for observation in observations], "in the atmosphere given")
     linear = array(starting(np.asarray(found.radiance), batch), problem.start.dtype)
     y = eliminate(jnp.concatenate([problem.start, linear]), found, problem)
-    problem = replace(problem, weight=weights(batch, light(y, found.radiance, problem)))
+    problem = replace(problem, weight=outermost(lit_weights)(y, found.radiance, problem))
     found = evaluated(*problem.split(y), problem)
     return _information(y, np.asarray(found.rows, float), problem, [label.name for label in labels])
 

@@ -75,14 +75,7 @@ class Problem(eqx.Module):
     def start(self) -> Coordinates:
         """``x`` at the start: no offset."""
         start = self.parameters.start
-        return jnp.concatenate([start, jnp.zeros(self.batch.nuisances.offsets, start.dtype)])
-
-    @property
-    def limits(self) -> tuple[Coordinates, Coordinates]:
-        """The smallest and the largest ``x``."""
-        lower, upper = self.parameters.limits
-        endless = jnp.full(self.batch.nuisances.offsets, jnp.inf, lower.dtype)
-        return jnp.concatenate([lower, -endless]), jnp.concatenate([upper, endless])
+        return jnp.concatenate([start, np.zeros(self.batch.nuisances.offsets, start.dtype)])
 
     def colours(self) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"]]:
         """For each coordinate of the atmosphere the tangent it shares, and the one channel it touches, -1 for all of them.
@@ -98,6 +91,13 @@ class Problem(eqx.Module):
     def known(self) -> bool:
         """Whether anything is known besides the images."""
         return self.priors is not None or self.batch.nuisances.offsets > 0
+
+
+def limits_of(problem: Problem) -> tuple[Coordinates, Coordinates]:
+    """The smallest and the largest ``x``."""
+    lower, upper = problem.parameters.limits
+    endless = jnp.full(problem.batch.nuisances.offsets, jnp.inf, lower.dtype)
+    return jnp.concatenate([lower, -endless]), jnp.concatenate([upper, endless])
 
 
 def planet_shell(model: Model, parameters: Parameters) -> Any:

@@ -34,7 +34,7 @@ from fitting.linearisation import Linearisation
 from fitting.nuisances import assumed
 from fitting.parameters import Coordinates, select
 from fitting.priors import Prior, Priors, collect
-from fitting.problem import Linear, Problem, whitened
+from fitting.problem import Linear, Problem, limits_of, whitened
 from fitting.quantities import numbers
 from fitting.result import FitResult
 from fitting.search import INTERRUPTED, minimise
@@ -239,7 +239,7 @@ def _next(walk: list[_Value], target: float, problem: Problem, optimum: _Optimum
         before = walk[-2]
         y = y + (y - before.y) * (target - walk[-1].number) / (walk[-1].number - before.number)
         x, linear = problem.split(y)
-        y = jnp.concatenate([jnp.clip(x, *problem.limits), linear])
+        y = jnp.concatenate([jnp.clip(x, *outermost(limits_of)(problem)), linear])
 
     def evaluate(x: Coordinates, linear: Linear, _: Problem) -> Linearisation:
         # The priors do not matter to the model, whose program of the fit is used again.

@@ -34,7 +34,7 @@ from fitting.elimination import RANK_TOLERANCE, eliminate, profile
 from fitting.least_squares import Factor, reduce
 from fitting.linearisation import Linearisation
 from fitting.parameters import Coordinates
-from fitting.problem import Linear, Problem
+from fitting.problem import Linear, Problem, limits_of
 
 ROUNDING_DISTANCE = 0.3
 """Distance below which rejected steps mean that rounding hides the last of the way."""
@@ -191,7 +191,7 @@ def minimise(
     begun = len(history)
     x, linear = problem.split(y)
     state = outermost(_start)(x)
-    limits = jax.tree.map(np.asarray, problem.limits)
+    limits = jax.tree.map(np.asarray, outermost(limits_of)(problem))
     freedom = max(count(problem.batch) - y.size, 1)
     stage = history[-1].stage + 1 if history else 1
     best: Point | None = None
@@ -222,8 +222,8 @@ def minimise(
                 size = size * (previous / misfit)
             state = eqx.tree_at(lambda s: (s.y_eval, s.search_state.step_size), state, (trial, size))
             change = float(np.max(np.abs(np.asarray(trial) - np.asarray(x))))
-            plane = array(held / math.sqrt(scale), x.dtype)
-            x, state = outermost(_step)(x, state, (plane[:, -1], plane[:, :-1], trial))
+            plane = held / math.sqrt(scale)
+            x, state = outermost(_step)(x, state, (*(array(p, x.dtype) for p in (plane[:, -1], plane[:, :-1])), trial))
             accepted = best is None or (finite and np.array_equal(x, trial))
             if best is None or accepted:
                 best = Point(whole, found, factor, chi2, distance(held, misfit), whole)

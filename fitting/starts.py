@@ -112,7 +112,7 @@ def thinned(batch: Batch, count: int = PIXELS) -> tuple[Batch, Int[np.ndarray, "
     size = min(count, used.shape[1])
     chosen = np.stack([np.flatnonzero(row)[np.linspace(0, row.sum() - 1, size).astype(int)] for row in used])
     image = np.arange(len(used))[:, None]
-    of_pixels = {name: getattr(batch, name)[image, chosen] for name in batch.pixel_fields}
+    of_pixels = {name: jax.device_put(np.asarray(getattr(batch, name))[image, chosen]) for name in batch.pixel_fields}
     return replace(batch, tiles=1, mesh=None, **of_pixels), chosen
 
 
@@ -145,7 +145,7 @@ def ranked(problem: Problem) -> list[Float[np.ndarray, " n"]]:
     known = (measured > 0) & np.asarray(batch.used)[..., None]
     off = []
     for radiance in found:
-        expected = radiance * np.asarray(batch.exposure(array(starting(radiance, batch))))
+        expected = radiance * np.asarray(outermost(Batch.exposure)(batch, array(starting(radiance, batch))))
         ratio = np.where(known, np.maximum(expected, 1e-30) / np.where(known, measured, 1), 1)
         off.append(float(np.mean(np.abs(np.log(ratio)) * noise * measured)))
     order = np.argsort(np.where(np.isfinite(off), off, np.inf), kind="stable")

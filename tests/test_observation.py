@@ -277,6 +277,10 @@ def test_white_balance_leaves_the_middle_channel():
     [
         ({"exposure": "free-per-channel", "white_balance": "lens"}, "a factor for each channel already"),
         ({"white_balance": ""}, "white_balance: got ''"),
+        ({"exposure": "fixd"}, "exposure: got 'fixd', did you mean 'fixed'"),
+        ({"exposure": "fre-per-channel"}, "exposure: .* did you mean 'free'"),
+        ({"pose": "Free"}, "pose: got 'Free', did you mean 'free'"),
+        ({"pose": 2}, 'pose: got 2, expected "fixed"'),
         ({"pixels": np.ones((32, 64))}, "expected numbers in the shape"),
         ({"pixels": np.ones((32, 63, 3))}, "63 x 32 .* and the camera 64 x 32"),
         ({"pixels": np.zeros((32, 64, 3))}, "no pixel is left to fit: of 2048 pixels .* black"),

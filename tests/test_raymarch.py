@@ -3,11 +3,12 @@
 import math
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from diffatmo.atmosphere import Atmosphere
+from diffatmo.atmosphere import Atmosphere, earth
 from diffatmo.models.raymarch import RayMarch
 
 BETA_R, BETA_M, H_R, H_M, G = (5.19673e-6, 12.1427e-6, 29.6453e-6), 21e-6, 8000.0, 1200.0, 0.76
@@ -88,3 +89,43 @@ def test_many_naive_steps_approach_the_exact_integral(x64):
 def test_no_steps_are_refused():
     with pytest.raises(ValueError, match="light_steps"):
         RayMarch(light_steps=0)
+
+
+@pytest.mark.parametrize("altitude", [99.9, 99.99, 99.9995])
+def test_all_but_horizontal_just_below_the_top(altitude):
+    """The cosine of 90° is 6e-17 or 4e-8, and single precision knows small climbs badly: the light is that of the horizontal.
+
+    Over mu = 4e-8 the light changes by 1e-3 of itself there at most, and its slope by as much; reverse mode has to add
+    slopes that may not drown each other.
+    """
+    sun = jnp.array([0.0, math.sin(math.radians(60)), 0.5], jnp.float32)
+
+    def light(altitude, mu):
+        view = jnp.stack([jnp.sqrt(1 - mu * mu), jnp.zeros_like(mu), mu])
+        seen = RayMarch().sky(earth()).radiance(altitude=altitude, view=view, sun=sun)
+        return jnp.sum(seen.radiance), seen.transmittance
+
+    mu = np.array([0.0, 6e-17, 4.37e-8, -4.37e-8], np.float32)
+    both = jax.jit(jax.vmap(jax.value_and_grad(light, has_aux=True), in_axes=(None, 0)))
+    (radiance, transmittance), slope = both(np.float32(altitude), mu)
+    np.testing.assert_allclose(radiance[1:], radiance[0], rtol=5e-3)
+    np.testing.assert_allclose(slope[1:], slope[0], rtol=5e-3)
+    assert np.all(transmittance > 0.99999)
+    # The path to the top is √(2 R d) long, in air whose density changes little over d.
+    np.testing.assert_allclose(slope[0] * 2 * (100 - np.float32(altitude)), -radiance[0], rtol=0.05)
+
+
+def test_a_small_planet_from_far_is_finite():
+    """Rounding of the distance is larger there than the planet."""
+    small = eqx.tree_at(lambda a: (a.bottom_radius, a.top_radius), earth(), (jnp.float32(1), jnp.float32(101)))
+    sun = jnp.array([0.0, math.sqrt(0.5), math.sqrt(0.5)], jnp.float32)
+
+    def light(view):
+        return jnp.sum(RayMarch().sky(small).radiance(altitude=jnp.float32(1e5), view=view, sun=sun).radiance)
+
+    down = np.radians([179.95, 179.99, 179.999, 180.0])
+    view = np.stack([0 * down, np.sin(down), np.cos(down)], axis=-1).astype(np.float32)
+    radiance, slopes = jax.jit(jax.vmap(jax.value_and_grad(light)))(view)
+    assert np.all(np.isfinite(radiance))
+    assert np.all(np.isfinite(slopes))
+    assert radiance[-1] > 0

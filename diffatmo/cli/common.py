@@ -87,7 +87,7 @@ def model_options(command: Any) -> Any:
             ),
             click.option("--samples", type=click.IntRange(min=32), help="Paths per ray of pathtrace.  [default: 4096]"),
             click.option(
-                "--seed", type=click.IntRange(min=0), help="Of the random numbers of pathtrace.  [default: 0]"
+                "--seed", type=click.IntRange(0, 2**32 - 1), help="Of the random numbers of pathtrace.  [default: 0]"
             ),
         )
     ):

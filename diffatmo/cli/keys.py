@@ -120,16 +120,16 @@ CAMERA_KEYS: dict[str, Key] = {
     "circle": Number(
         "Diameter of a fisheye's circle, in units of the picture's shorter side.  [default: 1]", 0, 100, positive=True
     ),
-    "yaw_deg": Number("Azimuth of the optical axis, or of a panorama's left edge, clockwise from north."),
+    "yaw_deg": Number("Azimuth of the optical axis, or of a panorama's left edge, clockwise from north.", -3600, 3600),
     "pitch_deg": Number("Elevation of the optical axis.", -90, 90),
-    "roll_deg": Number("Clockwise turn of the camera about its optical axis."),
+    "roll_deg": Number("Clockwise turn of the camera about its optical axis.", -3600, 3600),
 }
 """How a camera is described."""
 
 PLACE_KEYS: dict[str, Key] = {
-    "altitude_km": Number("Height of the camera above the ground.", 0),
+    "altitude_km": Number("Height of the camera above the ground.", 0, 1e9),
     "sun_zenith_deg": Number("Zenith angle of the sun; above 90 it is below the horizon.", 0, 180),
-    "sun_azimuth_deg": Number("Azimuth of the sun, clockwise from north."),
+    "sun_azimuth_deg": Number("Azimuth of the sun, clockwise from north.", -3600, 3600),
     "time": Moment("Instead, with a latitude and a longitude: when it is, like 2024-06-21T12:00:00+02:00."),
     "latitude_deg": Number("Where it is, north positive.", -90, 90),
     "longitude_deg": Number("Where it is, east positive.", -180, 180),

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from diffatmo.models import Model, Sky
 
 COLUMNS = {
-    "altitude_km": Number("Height above the ground.", 0),
+    "altitude_km": Number("Height above the ground.", 0, 1e9),
     "sun_zenith_deg": Number("Zenith angle of the sun.", 0, 180),
     "view_zenith_deg": Number("Zenith angle of the view: 0 is up, 180 down.", 0, 180),
     "view_azimuth_deg": Number("Azimuth of the view relative to the sun's."),

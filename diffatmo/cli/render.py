@@ -25,9 +25,7 @@ if TYPE_CHECKING:
     from diffatmo.atmosphere import Atmosphere
     from diffatmo.render import Scene
 
-EXPOSURE = {
-    "exposure": Number("Pixels are radiance times this.  [default: 1; for PNG, by the picture]", 0, positive=True)
-}
+EXPOSURE = {"exposure": Number("Pixels are radiance times this.  [default: 1; for PNG, by the picture]", 1e-30, 1e30)}
 DEFAULTS = {"projection": "equirectangular", "altitude_km": 0.1, "sun_zenith_deg": 45.0, "sun_azimuth_deg": 0.0}
 DEFAULT_WIDTH = 512
 SIZE = click.IntRange(1, 16384)

@@ -55,7 +55,7 @@ IMAGE_KEYS: dict[str, Key] = {
         "The camera may be turned by a small rotation: fixed, free, or the name of a group.  [default: fixed]"
     ),
     "pose_error_deg": Number("Standard deviation of each of its angles.  [default: 2]", 0, 30, positive=True),
-    "heading_error_deg": Number("Of the turn about the vertical.  [default: as pose_error_deg]", 0, 60, positive=True),
+    "heading_error_deg": Number("Of the turn about the vertical.  [default: as pose_error_deg]", 0, 57, positive=True),
     "focal": Word("The focal length may be off by a factor: fixed, free, or the name of a group.  [default: fixed]"),
     "focal_error": Number("Standard deviation of its logarithm.  [default: 0.05]", 0, 1, positive=True),
     "vignetting": Word("The lens may darken the corners: fixed, free, or the name of a group.  [default: fixed]"),
