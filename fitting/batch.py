@@ -170,7 +170,7 @@ def stack(observations: Sequence[Observation], wavelengths: Sequence[float], mes
         sun=number(np.stack([observation.sun for observation in observations])),
         directions=number(directions),
         # Pixels that are not finite are shown and counted but never used (fitting.observation); 0 * NaN would be NaN.
-        measured=number(np.nan_to_num(padded("image", np.float32(0)), posinf=0.0, neginf=0.0)),
+        measured=number(np.nan_to_num(padded("image", np.float32(0)), copy=False, posinf=0.0, neginf=0.0)),
         used=number(padded("used", False)),
         noise=noise("noise", 0.0),
         noise_shot=noise("noise_shot", 0.0),

@@ -36,7 +36,7 @@ class Correction(eqx.Module):
     @classmethod
     def constant(cls, ratio: Ratio, at: Float[Array, " x"]) -> "Correction":
         """The same ratio everywhere."""
-        none = array(np.zeros((*ratio.shape, DIRECTIONS)), ratio.dtype)
+        none = array(np.zeros((*ratio.shape, DIRECTIONS), ratio.dtype), ratio.dtype)
         return cls(ratio, at, none, array(np.zeros((DIRECTIONS, at.size)), at.dtype))
 
     def steps(self, x: Float[Array, " x"]) -> Float[Array, " k"]:

@@ -66,7 +66,9 @@ def pose(
     problem = Problem(model, parameters, batch, weight, shell, priors=known, loss=robust, fields=fields)
     if finer is None:
         return problem
-    return replace(problem, correction=Correction.constant(array(np.ones(signal.shape), signal.dtype), problem.start))
+    return replace(
+        problem, correction=Correction.constant(array(np.ones(signal.shape, signal.dtype), signal.dtype), problem.start)
+    )
 
 
 def measured_light(batch: Batch) -> Float[np.ndarray, "image pixel w"]:
@@ -141,8 +143,8 @@ def _ratio(x: Coordinates, radiance: Predicted, problem: Problem, finer: Model) 
 
 def _added(y: Coordinates, radiance: Predicted, problem: Problem, part: Float[np.ndarray, "image pixel w"]) -> float:
     """Such a part of the light, in units of the noise, over all pixels."""
-    lit = np.asarray(outermost(light)(y, radiance, problem), dtype=np.float64)
-    return float(np.linalg.norm(lit * np.asarray(problem.weight) * part))
+    lit = np.asarray(outermost(light)(y, radiance, problem))
+    return float(np.linalg.norm(np.asarray(lit * np.asarray(problem.weight) * part, dtype=np.float64)))
 
 
 def _open_steps(y: Coordinates, found: Linearisation, problem: Problem) -> list[tuple[Float[np.ndarray, " x"], float]]:

@@ -365,9 +365,8 @@ def _check_choice(refuse: _Refusal, key: str, value: Any) -> None:
     """Refuse what is no choice, and what is nearly ``fixed`` or ``free``: misspelt, it would be the name of a group."""
     expected = '"fixed", "free" or a name' + ", a number that is known is exposure_value" * (key == "exposure")
     refuse.unless(isinstance(value, str) and value != FIXED + PER_CHANNEL, key, repr(value), expected)
-    name = value.removesuffix(PER_CHANNEL)
-    alike = name == value or key in ("exposure", "pedestal")
-    refuse.unless(bool(name) and alike and not name.endswith(PER_CHANNEL), key, repr(value), expected)
+    name = value.removesuffix(PER_CHANNEL) if key in ("exposure", "pedestal") else value
+    refuse.unless(bool(name) and not name.endswith(PER_CHANNEL), key, repr(value), expected)
     near = difflib.get_close_matches(name.lower(), (FIXED, FREE), n=1, cutoff=0.8)
     if near and name not in near:
         refuse(f"{key}: got {value!r}, did you mean {near[0]!r}? As the name of a group it is too much like it")

@@ -223,7 +223,8 @@ def minimise(
             state = eqx.tree_at(lambda s: (s.y_eval, s.search_state.step_size), state, (trial, size))
             change = float(np.max(np.abs(np.asarray(trial) - np.asarray(x))))
             plane = held / math.sqrt(scale)
-            x, state = outermost(_step)(x, state, (*(array(p, x.dtype) for p in (plane[:, -1], plane[:, :-1])), trial))
+            residual, slope = (array(part, x.dtype) for part in (plane[:, -1], plane[:, :-1]))
+            x, state = outermost(_step)(x, state, (residual, slope, trial))
             accepted = best is None or (finite and np.array_equal(x, trial))
             if best is None or accepted:
                 best = Point(whole, found, factor, chi2, distance(held, misfit), whole)

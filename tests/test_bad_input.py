@@ -137,6 +137,22 @@ CASES = {
     "no output": (["radiance", "GOOD.toml", "GOOD.csv"], "--output"),
     "unknown model": (["radiance", "GOOD.toml", "GOOD.csv", "-o", "new.csv", "--model", "magic"], "magic"),
     # atmospheres
+    "seed of too many bits": (
+        ["render", "GOOD.toml", "-o", "new.png", "--model", "pathtrace", "--seed", "9" * 20],
+        "--seed",
+    ),
+    "exposure beyond single precision": (
+        ["render", "GOOD.toml", "-o", "new.exr", "--exposure", "1e39"],
+        "from 1e-30 to 1e+30",
+    ),
+    "altitude beyond single precision": (
+        ["render", "GOOD.toml", "-o", "new.exr", "--altitude-km", "1e39"],
+        "from 0 to 1e+09",
+    ),
+    "azimuth beyond reason": (
+        ["render", "GOOD.toml", "-o", "new.exr", "--sun-azimuth-deg", "1e300"],
+        "from -3600 to 3600",
+    ),
     "no such atmosphere": (["render", "venus", "-o", "new.exr"], "presets"),
     "not TOML": (["render", "UNCLOSED.toml", "-o", "new.exr"], "TOML"),
     "binary atmosphere": (["render", "BINARY.toml", "-o", "new.exr"], "BINARY.toml"),

@@ -279,6 +279,7 @@ def test_white_balance_leaves_the_middle_channel():
         ({"white_balance": ""}, "white_balance: got ''"),
         ({"exposure": "fixd"}, "exposure: got 'fixd', did you mean 'fixed'"),
         ({"exposure": "fre-per-channel"}, "exposure: .* did you mean 'free'"),
+        ({"pose": "free-per-channel"}, "pose: got 'free-per-channel', expected"),
         ({"pose": "Free"}, "pose: got 'Free', did you mean 'free'"),
         ({"pose": 2}, 'pose: got 2, expected "fixed"'),
         ({"pixels": np.ones((32, 64))}, "expected numbers in the shape"),
