@@ -64,6 +64,14 @@ class DensityProfile(eqx.Module):
         )
 
 
+def _numbers(value: Any) -> Any:
+    """``value`` as an array of JAX's; what holds no numbers, as one of NumPy's, for :func:`check` to name."""
+    try:
+        return array(value)
+    except (TypeError, ValueError):
+        return np.array(value, dtype=object)
+
+
 class Atmosphere(eqx.Module):
     """All parameters of a planet's sky, at ``w`` wavelengths.
 
@@ -72,20 +80,20 @@ class Atmosphere(eqx.Module):
     nothing. Raises :class:`AtmosphereError` for a value outside its range.
     """
 
-    wavelengths: Spectrum = eqx.field(converter=array)
-    solar_irradiance: Spectrum = eqx.field(converter=array)
-    bottom_radius: Scalar = eqx.field(converter=array)
-    top_radius: Scalar = eqx.field(converter=array)
-    rayleigh_scattering: Spectrum = eqx.field(converter=array)
-    rayleigh_scale_height: Scalar = eqx.field(converter=array)
-    mie_scattering: Spectrum = eqx.field(converter=array)
-    mie_absorption: Spectrum = eqx.field(converter=array)
-    mie_scale_height: Scalar = eqx.field(converter=array)
-    mie_g: Scalar = eqx.field(converter=array)
-    ozone_absorption: Spectrum = eqx.field(converter=array)
-    ground_albedo: Spectrum = eqx.field(converter=array)
-    ozone_center_altitude: Scalar = eqx.field(converter=array, default=25.0)
-    ozone_half_width: Scalar = eqx.field(converter=array, default=15.0)
+    wavelengths: Spectrum = eqx.field(converter=_numbers)
+    solar_irradiance: Spectrum = eqx.field(converter=_numbers)
+    bottom_radius: Scalar = eqx.field(converter=_numbers)
+    top_radius: Scalar = eqx.field(converter=_numbers)
+    rayleigh_scattering: Spectrum = eqx.field(converter=_numbers)
+    rayleigh_scale_height: Scalar = eqx.field(converter=_numbers)
+    mie_scattering: Spectrum = eqx.field(converter=_numbers)
+    mie_absorption: Spectrum = eqx.field(converter=_numbers)
+    mie_scale_height: Scalar = eqx.field(converter=_numbers)
+    mie_g: Scalar = eqx.field(converter=_numbers)
+    ozone_absorption: Spectrum = eqx.field(converter=_numbers)
+    ground_albedo: Spectrum = eqx.field(converter=_numbers)
+    ozone_center_altitude: Scalar = eqx.field(converter=_numbers, default=25.0)
+    ozone_half_width: Scalar = eqx.field(converter=_numbers, default=15.0)
     mie_phase: Shape = eqx.field(static=True, default="henyey-greenstein")
 
     def __check_init__(self) -> None:
@@ -185,6 +193,8 @@ def check(atmosphere: Atmosphere) -> None:
         value = getattr(atmosphere, name)
         if name == "mie_phase":
             continue
+        if isinstance(value, np.ndarray):
+            _refuse(name, value.tolist(), "numbers")
         if name in SPECTRAL:
             if value.ndim != 1 or value.size == 0:
                 _refuse(name, f"an array of shape {value.shape}", "a list with one number per wavelength")

@@ -5,6 +5,11 @@ import tokenize
 import zipfile
 import zlib
 from collections.abc import Sequence
+from numbers import Real
+from typing import Any
+
+import jax
+import numpy as np
 
 DAMAGED = (
     ValueError,
@@ -24,6 +29,11 @@ DAMAGED = (
 
 class FitError(ValueError):
     """A fit was asked for that cannot be done; the message says what is wrong and what would be right."""
+
+
+def is_number(value: Any) -> bool:
+    """Whether ``value`` is one real number: Python's, NumPy's or JAX's."""
+    return isinstance(value, Real) or (isinstance(value, np.ndarray | jax.Array) and value.shape == ())
 
 
 def did_you_mean(name: object, known: Sequence[str]) -> str:

@@ -15,12 +15,17 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array
 
+from fitting._errors import FitError
 from fitting.linearisation import AXIS, Linearisation, spread
 from fitting.problem import Problem
 
 
 def mesh_of(devices: Sequence[jax.Device] | None) -> Mesh | None:
-    """``devices``, or all that there are; None if that is a single one."""
+    """``devices``, or all that there are; None if that is a single one. Raises :class:`FitError` for anything else."""
+    if devices is not None and not (
+        isinstance(devices, Sequence) and devices and all(isinstance(device, jax.Device) for device in devices)
+    ):
+        raise FitError(f"devices: got {devices!r}, expected some of jax.devices()")
     chosen = jax.devices() if devices is None else list(devices)
     return Mesh(np.array(chosen), (AXIS,)) if len(chosen) > 1 else None
 

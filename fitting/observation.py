@@ -14,7 +14,8 @@ horizon only.
 
 import difflib
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from numbers import Integral
 from typing import Any, NamedTuple, Protocol
 
 import equinox as eqx
@@ -25,7 +26,7 @@ from jaxtyping import Array, Bool, Float
 
 from diffatmo.bands import Bands
 from diffatmo.camera import Camera, CameraError
-from fitting._errors import FitError
+from fitting._errors import FitError, is_number
 
 FIXED = "fixed"
 FREE = "free"
@@ -203,12 +204,15 @@ def observe(
         name: Of the image, in messages, tables and file names.
     """
     refuse = _Refusal(name)
+    refuse.unless(isinstance(name, str), "name", name, "a text")
     image = np.asarray(pixels)
-    if image.ndim != 3 or 0 in image.shape or not np.issubdtype(image.dtype, np.number):
+    if image.ndim != 3 or 0 in image.shape or image.dtype.kind not in "iuf":
         refuse(
-            f"pixels: got shape {image.shape} of {image.dtype}, expected numbers in the shape (height, width, channels)"
+            f"pixels: got shape {image.shape} of {image.dtype}, expected real numbers in the shape (height, width, channels)"
         )
     image = image.astype(np.float32)
+    refuse.unless(isinstance(camera, Camera), "camera", camera, "a camera, like diffatmo.Fisheye(256, 256)")
+    refuse.unless(bands is None or isinstance(bands, Bands), "bands", bands, "diffatmo.bands.Bands")
     if bands is not None and len(bands.names) != image.shape[-1]:
         refuse(
             f"bands: {len(bands.names)} of them ({', '.join(bands.names)}), but the image has {image.shape[-1]} channels"
@@ -217,22 +221,20 @@ def observe(
     if directions.shape[:2] != image.shape[:2]:
         size = "{1} x {0}".format(*directions.shape[:2])
         refuse(f"pixels: the image is {image.shape[1]} x {image.shape[0]} (width x height) and the camera {size}")
-    toward_sun = np.asarray(sun, dtype=np.float32)
+    toward_sun = refuse.numbers("sun", sun, "a unit vector towards the sun")
     if toward_sun.shape != (3,) or not np.all(np.isfinite(toward_sun)) or abs(np.linalg.norm(toward_sun) - 1) > 1e-3:
-        refuse(f"sun: got {np.asarray(sun).tolist()}, expected a unit vector towards the sun")
-    refuse.unless(altitude >= 0 and math.isfinite(altitude), "altitude", altitude, "kilometres >= 0")
-    refuse.unless(0 <= sun_exclusion < math.pi, "sun_exclusion", sun_exclusion, "radians from 0 to less than π")
-    refuse.unless(
-        0 < view_zenith_max <= math.pi, "view_zenith_max", view_zenith_max, "radians, more than 0 and up to π"
+        refuse(f"sun: got {toward_sun.tolist()}, expected a unit vector towards the sun")
+    refuse.number("altitude", altitude, lambda km: 0 <= km < math.inf, "kilometres >= 0")
+    refuse.number("sun_exclusion", sun_exclusion, lambda a: 0 <= a < math.pi, "radians from 0 to less than π")
+    refuse.number("view_zenith_max", view_zenith_max, lambda a: 0 < a <= math.pi, "radians, more than 0 and up to π")
+    refuse.number(
+        "horizon_exclusion", horizon_exclusion, lambda a: 0 <= a < math.pi / 2, "radians from 0 to less than π/2"
     )
-    refuse.unless(
-        0 <= horizon_exclusion < math.pi / 2, "horizon_exclusion", horizon_exclusion, "radians from 0 to less than π/2"
-    )
-    refuse.unless(
-        exposure_value > 0 and math.isfinite(exposure_value), "exposure_value", exposure_value, "a finite number > 0"
-    )
-    refuse.unless(saturation is None or saturation > 0, "saturation", saturation, "a number > 0")
-    refuse.unless(max_pixels >= 1, "max_pixels", max_pixels, "at least 1")
+    refuse.number("exposure_value", exposure_value, lambda e: 0 < e < math.inf, "a finite number > 0")
+    if saturation is not None:
+        refuse.number("saturation", saturation, lambda white: white > 0, "a number > 0")
+    for key, pieces in (("max_pixels", max_pixels), ("merged", merged)):
+        refuse.unless(isinstance(pieces, Integral) and pieces >= 1, key, pieces, "a whole number, at least 1")
     for key, value in (
         ("exposure", exposure),
         ("pedestal", pedestal),
@@ -249,20 +251,18 @@ def observe(
     for key, error in (
         ("sun_offset_error", sun_offset_error),
         ("pose_error", pose_error),
-        ("heading_error", heading_error),
+        ("heading_error", pose_error if heading_error is None else heading_error),
         ("focal_error", focal_error),
         ("vignetting_error", vignetting_error),
         ("tone_error", tone_error),
         ("chroma_error", chroma_error),
         ("aerosol_error", aerosol_error),
     ):
-        if error is None:
-            continue
         radians = " rad" if key in ("sun_offset_error", "pose_error", "heading_error") else ""
-        refuse.unless(0 < error <= 1, key, error, f"more than 0 and at most 1{radians}")
-    memory = aerosol_memory_h
-    refuse.unless(memory > 0 and math.isfinite(memory), "aerosol_memory_h", memory, "a finite number of hours > 0")
-    refuse.unless(time_h is None or math.isfinite(time_h), "time_h", time_h, "a finite number of hours")
+        refuse.number(key, error, lambda error: 0 < error <= 1, f"more than 0 and at most 1{radians}")
+    refuse.number("aerosol_memory_h", aerosol_memory_h, lambda h: 0 < h < math.inf, "a finite number of hours > 0")
+    if time_h is not None:
+        refuse.number("time_h", time_h, math.isfinite, "a finite number of hours")
     if focal != FIXED:
         try:
             camera.zoomed(1.0)
@@ -271,9 +271,11 @@ def observe(
     if exposure.endswith(PER_CHANNEL) and white_balance != FIXED:
         refuse(f"exposure: {exposure!r} has a factor for each channel already, expected white_balance fixed beside it")
 
-    for bad in _reasons(mask).values():
-        if bad.shape != image.shape[:2]:
-            refuse(f"mask: got shape {bad.shape}, expected {image.shape[:2]} like the image")
+    for given in map(np.asarray, mask.values() if isinstance(mask, Mapping) else () if mask is None else (mask,)):
+        if given.shape != image.shape[:2] or given.dtype.kind not in "biu":
+            refuse(
+                f"mask: got shape {given.shape} of {given.dtype}, expected {image.shape[:2]} of bool, like the image"
+            )
     left_out = exclusions(
         image,
         camera=camera,
@@ -358,31 +360,40 @@ class _Refusal(NamedTuple):
 
     def unless(self, good: bool, key: str, value: Any, expected: str) -> None:
         if not good:
-            self(f"{key}: got {value}, expected {expected}")
+            self(f"{key}: got {repr(value) if isinstance(value, str) else value}, expected {expected}")
+
+    def number(self, key: str, value: Any, good: Callable[[float], bool], expected: str) -> None:
+        """Refuse what is no number, and what is not ``good``."""
+        self.unless(is_number(value) and good(float(value)), key, value, expected)
+
+    def numbers(self, key: str, value: Any, expected: str) -> Float[np.ndarray, "..."]:
+        """``value`` as an array."""
+        try:
+            return np.asarray(value, dtype=np.float32)
+        except (TypeError, ValueError):
+            raise FitError(f"{self.name}: {key}: got {value!r}, expected {expected}") from None
 
 
 def _check_choice(refuse: _Refusal, key: str, value: Any) -> None:
     """Refuse what is no choice, and what is nearly ``fixed`` or ``free``: misspelt, it would be the name of a group."""
     expected = '"fixed", "free" or a name' + ", a number that is known is exposure_value" * (key == "exposure")
-    refuse.unless(isinstance(value, str) and value != FIXED + PER_CHANNEL, key, repr(value), expected)
+    refuse.unless(isinstance(value, str) and value != FIXED + PER_CHANNEL, key, value, expected)
     name = value.removesuffix(PER_CHANNEL) if key in ("exposure", "pedestal") else value
-    refuse.unless(bool(name) and not name.endswith(PER_CHANNEL), key, repr(value), expected)
+    refuse.unless(bool(name) and not name.endswith(PER_CHANNEL), key, value, expected)
     near = difflib.get_close_matches(name.lower(), (FIXED, FREE), n=1, cutoff=0.8)
     if near and name not in near:
         refuse(f"{key}: got {value!r}, did you mean {near[0]!r}? As the name of a group it is too much like it")
 
 
 def _per_pixel(refuse: _Refusal, key: str, value: float | np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    try:
-        array = np.asarray(value, dtype=np.float32)
-    except (TypeError, ValueError):
-        refuse(f"{key}: got {value!r}, expected one number, or one per channel or pixel of {shape}")
+    expected = f"one number, or one per channel or pixel of {shape}"
+    array = refuse.numbers(key, value, expected)
     if array.shape == shape[:2]:
         array = array[..., None]
     try:
         array = np.broadcast_to(array, shape)
     except ValueError:
-        refuse(f"{key}: got shape {array.shape}, expected one number, or one per channel or pixel of {shape}")
+        refuse(f"{key}: got shape {array.shape}, expected {expected}")
     if not np.all(np.isfinite(array)) or np.any(array < 0):
         refuse(f"{key}: expected finite numbers >= 0")
     return array
@@ -446,7 +457,7 @@ def _beyond(
 def _reasons(mask: np.ndarray | Mapping[str, np.ndarray] | None) -> Mapping[str, np.ndarray]:
     """What a mask leaves out, by reason."""
     if mask is None or isinstance(mask, Mapping):
-        return mask or {}
+        return {reason: np.asarray(bad, bool) for reason, bad in (mask or {}).items()}
     return {"masked by the user": ~np.asarray(mask, bool)}
 
 

@@ -340,6 +340,8 @@ def select(init: Atmosphere, free: Sequence[str], tie: Mapping[str, str] | None 
         raise FitError("free: bottom_radius and top_radius bound each other; free only one of them")
     if "mie_g" in free and isinstance(init.mie_phase, PhaseTable):
         raise FitError("free: 'mie_g' means nothing to an aerosol with a tabulated phase function")
+    if not isinstance(tie, Mapping | None):
+        raise FitError(f"tie: got {tie!r}, expected a kind for each name, like {{'mie_scattering': 'grey'}}")
     ties = dict(tie or {})
     _check_ties(ties, free)
     blocks: list[Block] = []

@@ -19,7 +19,7 @@ from diffatmo import constants, spectrum
 from diffatmo.atmosphere import Atmosphere
 from diffatmo.compiling import outermost
 from diffatmo.numerics import array, safe_log
-from fitting._errors import FitError, did_you_mean
+from fitting._errors import FitError, did_you_mean, is_number
 from fitting.parameters import Coordinates, Parameters
 from fitting.quantities import DERIVED, REFERENCE_NM, Quantity, numbers, quantities, spectral_name
 
@@ -36,7 +36,7 @@ class Prior:
 
     ``name`` is a number of the result (``rayleigh_optical_depth_550``), or a spectral field, which means each of its
     wavelengths on its own; where they vary as one number, as by a tie, it is known once, at the wavelength nearest to 550 nm.
-    With ``relative``, ``error`` is one of the logarithm: 0.1 for 10 %, ln 2 for a factor of two.
+    With ``relative``, ``error`` is one of the logarithm: 0.1 for 10 %, ln 2 for a factor of two. Raises :class:`FitError`.
     """
 
     name: str
@@ -44,6 +44,20 @@ class Prior:
     error: float
     relative: bool = False
     source: str = ""
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.name, str):
+            raise FitError(f"prior: got the name {self.name!r}, expected that of a number, like 'mie_g'")
+        for key, value in (("value", self.value), ("error", self.error)):
+            if not is_number(value):
+                raise FitError(f"prior: {self.name}: {key}: got {value!r}, expected a number")
+        if not (SMALLEST <= self.error <= LARGEST and abs(self.value) <= LARGEST):
+            raise FitError(
+                f"prior: {self}: expected a finite value and a finite error > 0, the value up to {LARGEST:g}, the error from "
+                f"{SMALLEST:g} to {LARGEST:g}"
+            )
+        if self.relative and not self.value > 0:
+            raise FitError(f"prior: {self}: a relative error needs a value > 0")
 
     def __str__(self) -> str:
         """As one would write it."""
@@ -84,13 +98,6 @@ def collect(priors: Sequence[Prior], parameters: Parameters) -> Priors | None:
     index: list[int] = []
     stated: list[Prior] = []
     for prior in priors:
-        if not (SMALLEST <= prior.error <= LARGEST and abs(prior.value) <= LARGEST):
-            raise FitError(
-                f"prior: {prior}: expected a finite value and a finite error > 0, the value up to {LARGEST:g}, the error from "
-                f"{SMALLEST:g} to {LARGEST:g}"
-            )
-        if prior.relative and not prior.value > 0:
-            raise FitError(f"prior: {prior}: a relative error needs a value > 0")
         # The name of one number may be that of a field as well.
         alone = any(prior.name == one.name for one in known) or not any(prior.name == one.field for one in known)
         name = prior.name if alone else _once(prior.name, parameters)
@@ -126,8 +133,8 @@ def molecular(parameters: Parameters, *, pressure_hpa: float = 1013.25, temperat
     air (λ⁻⁴ by 2 %) adds to its error.
     """
     for name, value in (("pressure_hpa", pressure_hpa), ("temperature_k", temperature_k)):
-        if not (value > 0 and math.isfinite(value)):
-            raise FitError(f"prior: molecular: {name}: got {value}, expected a number > 0")
+        if not (is_number(value) and 0 < value < math.inf):
+            raise FitError(f"prior: molecular: {name}: got {value!r}, expected a number > 0")
     height = constants.GAS_CONSTANT * temperature_k / (constants.MOLAR_MASS_AIR * constants.GRAVITY) / 1000
     # The coefficients of the spectrum are those of sea level in the standard atmosphere.
     wavelengths = parameters.init.wavelengths

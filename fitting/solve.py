@@ -21,7 +21,7 @@ from diffatmo.compiling import compile_ahead, outermost
 from diffatmo.models.base import Model
 from diffatmo.numerics import array
 from fitting import model_error
-from fitting._errors import FitError
+from fitting._errors import FitError, is_number
 from fitting.batch import Batch, stack
 from fitting.checkpoint import digest, load
 from fitting.devices import mesh_of
@@ -122,12 +122,15 @@ def solve(
         raise FitError(f"init: got {init!r}, expected an Atmosphere, like diffatmo.earth()")
     if not isinstance(model, Model):
         raise FitError(f"model: got {model!r}, expected a model, like diffatmo.models.Moments()")
-    if max_steps < 1:
-        raise FitError(f"max_steps: got {max_steps}, expected at least 1")
-    if starts is not None and not (isinstance(starts, Integral) and starts >= 1):
-        raise FitError(f"starts: got {starts!r}, expected at least 1, and a whole number")
-    if not 0 < tolerance < math.inf:
-        raise FitError(f"tolerance: got {tolerance}, expected a finite number > 0")
+    for name, number in (("max_steps", max_steps), ("starts", 1 if starts is None else starts)):
+        if not (isinstance(number, Integral) and number >= 1):
+            raise FitError(f"{name}: got {number!r}, expected at least 1, and a whole number")
+    if not (is_number(tolerance) and 0 < tolerance < math.inf):
+        raise FitError(f"tolerance: got {tolerance!r}, expected a finite number > 0")
+    if not isinstance(refine, bool):
+        raise FitError(f"refine: got {refine!r}, expected True or False")
+    if progress is not None and not callable(progress):
+        raise FitError(f"progress: got {progress!r}, expected a function of a Step")
     began = time.perf_counter()
     parameters = select(init, free, tie)
     # A checkpoint that does not belong here is found before anything is computed.

@@ -10,6 +10,7 @@ of their fields with their ``type``. A model that is not one of diffatmo's own i
 import dataclasses
 import json
 import math
+import zipfile
 from collections.abc import Callable, Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -82,6 +83,8 @@ def load(path: str | Path, kind: type[F]) -> F:
     """
     try:
         with Path(path).open("rb") as file:
+            if not zipfile.is_zipfile(file):
+                raise FitError(f"{path}: not a saved fit, or one that is cut short; expected a file of FitResult.save")
             archive = np.load(file, allow_pickle=False)
             if not isinstance(archive, Mapping) or RECORD not in archive:
                 raise FitError(f"{path}: not a saved fit, expected a file that FitResult.save has written")

@@ -265,6 +265,8 @@ def fit(
     model = Moments() if model is None else model
     observations = _listed(observations, Observation, "observations", "fitting.observe(...), or a list of them")
     priors = _listed(priors, Prior, "priors", "fitting.Prior(name, value, error), or a list of them")
+    if not isinstance(checkpoint, str | Path | None):
+        raise FitError(f"checkpoint: got {checkpoint!r}, expected the path of a file")
     free = free if isinstance(free, str) else _listed(free, str, "free", "a list of names of parameters")
     solution = solve(
         observations,

@@ -1,5 +1,7 @@
 """The parameters: round trip, refusals, presets, density profiles."""
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -79,6 +81,12 @@ def test_bad_values_are_refused_by_name(old, new, named):
     with pytest.raises(AtmosphereError, match=r"test\.toml") as refusal:
         atmosphere.loads(GOOD.replace(old, new), "test.toml")
     assert named in str(refusal.value)
+
+
+@pytest.mark.parametrize("value", ["big", [["a"]], object, {}])
+def test_what_is_no_number_is_refused_by_name(value):
+    with pytest.raises(AtmosphereError, match=r"^mie_g: got .*, expected numbers"):
+        replace(earth(), mie_g=value)
 
 
 def test_a_missing_file_is_named(tmp_path):

@@ -282,7 +282,7 @@ def test_white_balance_leaves_the_middle_channel():
         ({"pose": "free-per-channel"}, "pose: got 'free-per-channel', expected"),
         ({"pose": "Free"}, "pose: got 'Free', did you mean 'free'"),
         ({"pose": 2}, 'pose: got 2, expected "fixed"'),
-        ({"pixels": np.ones((32, 64))}, "expected numbers in the shape"),
+        ({"pixels": np.ones((32, 64))}, "expected real numbers in the shape"),
         ({"pixels": np.ones((32, 63, 3))}, "63 x 32 .* and the camera 64 x 32"),
         ({"pixels": np.zeros((32, 64, 3))}, "no pixel is left to fit: of 2048 pixels .* black"),
         ({"pixels": np.full((32, 64, 3), np.nan)}, "no pixel is left .* not finite"),
@@ -306,11 +306,31 @@ def test_white_balance_leaves_the_middle_channel():
         ({"exposure": 2.0}, "exposure: got 2.0, .*a number that is known is exposure_value"),
         ({"saturation": 0.0}, "saturation"),
         ({"max_pixels": 0}, "max_pixels"),
+        ({"max_pixels": math.inf}, "max_pixels: got inf, expected a whole number"),
+        ({"merged": "two"}, "merged: got 'two', expected a whole number"),
+        ({"pixels": np.ones((32, 64, 3), complex)}, "of complex128, expected real numbers"),
+        ({"camera": "fisheye"}, "camera: got 'fisheye', expected a camera"),
+        ({"bands": "rgb"}, "bands: got 'rgb'"),
+        ({"sun": "up"}, "sun: got 'up', expected a unit vector"),
+        ({"altitude": None}, "altitude: got None, expected kilometres"),
+        ({"altitude": [0.1, 0.2]}, r"altitude: got \[0.1, 0.2\]"),
+        ({"exposure_value": "2"}, "exposure_value: got '2'"),
+        ({"pose_error": None}, "pose_error: got None"),
+        ({"heading_error": "wide"}, "heading_error: got 'wide'"),
+        ({"time_h": "noon"}, "time_h: got 'noon'"),
+        ({"mask": {"cloud": 1}}, r"mask: got shape \(\) of int64"),
+        ({"mask": np.full((32, 64), np.nan)}, "of float64, expected .* of bool"),
     ],
 )
 def test_refuses(options, message):
     with pytest.raises(FitError, match=f"^sky: .*{message}"):
         observe(**options)
+
+
+def test_a_mask_may_hold_whole_numbers():
+    mask = np.where(np.arange(64) < 16, 0, 255) * np.ones((32, 1), np.uint8)
+    assert observe(mask=mask).masked["masked by the user"] == 16 * 16
+    assert observe(mask={"cloud": mask}).masked["cloud"] == 16 * 48
 
 
 def test_refuses_images_that_do_not_go_together():

@@ -192,23 +192,32 @@ def test_what_is_one_number_is_known_once():
 @pytest.mark.parametrize(
     ("prior", "message"),
     [
-        (Prior("mie_g", 0.7, 0.0), "error > 0"),
-        (Prior("mie_g", float("nan"), 0.1), "finite value"),
-        (Prior("mie_g", 1e39, 1.0), "value up to 1e\\+15"),
-        (Prior("mie_g", 0.7, 1e-45), "error from 1e-15"),
-        (Prior("mie_g", -0.1, 0.1, relative=True), "relative error needs a value > 0"),
-        (Prior("ozone_column", 300.0, 30.0), "does not vary in this fit"),
-        (Prior("mie_gg", 0.7, 0.1), "'mie_gg' does not vary"),
+        (("mie_g", 0.7, 0.0), "error > 0"),
+        (("mie_g", float("nan"), 0.1), "finite value"),
+        (("mie_g", 1e39, 1.0), "value up to 1e\\+15"),
+        (("mie_g", 0.7, 1e-45), "error from 1e-15"),
+        (("mie_g", -0.1, 0.1, True), "relative error needs a value > 0"),
+        (("mie_g", "0.7", 0.1), "mie_g: value: got '0.7', expected a number"),
+        (("mie_g", 0.7, None), "mie_g: error: got None, expected a number"),
+        ((5, 0.7, 0.1), "got the name 5"),
     ],
 )
-def test_refuses(prior, message):
+def test_what_is_no_prior_is_refused(prior, message):
     with pytest.raises(FitError, match=message):
-        priors.collect([prior], select(toy_sky.truth(), FEW))
+        Prior(*prior)
+
+
+@pytest.mark.parametrize("name", ["ozone_column", "mie_gg"])
+def test_a_prior_on_what_does_not_vary_is_refused(name):
+    with pytest.raises(FitError, match=f"'{name}' does not vary in this fit"):
+        priors.collect([Prior(name, 0.7, 0.1)], select(toy_sky.truth(), FEW))
 
 
 def test_refuses_unphysical_weather():
     with pytest.raises(FitError, match="pressure_hpa"):
         priors.molecular(AIR, pressure_hpa=-1.0)
+    with pytest.raises(FitError, match="temperature_k: got 'cold'"):
+        priors.molecular(AIR, temperature_k="cold")
     with pytest.raises(FitError, match="latitude 100"):
         priors.ozone(latitude_deg=100, longitude_deg=0, day_of_year=1)
     with pytest.raises(FitError, match="continental average"):

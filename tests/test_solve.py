@@ -221,6 +221,14 @@ def test_refuses():
         ({"free": None}, "free: got NoneType, expected a list of names"),
         ({"free": ["nothing"]}, "'nothing' cannot be free"),
         ({"init": "earth"}, "init: got 'earth', expected an Atmosphere"),
+        ({"max_steps": 2.5}, "max_steps: got 2.5, expected at least 1, and a whole number"),
+        ({"tolerance": "fine"}, "tolerance: got 'fine', expected a finite number"),
+        ({"refine": "no"}, "refine: got 'no', expected True or False"),
+        ({"progress": 5}, "progress: got 5, expected a function"),
+        ({"checkpoint": 5}, "checkpoint: got 5, expected the path"),
+        ({"devices": "cpu"}, r"devices: got 'cpu', expected some of jax.devices\(\)"),
+        ({"devices": []}, r"devices: got \[\]"),
+        ({"tie": "grey"}, "tie: got 'grey', expected a kind for each name"),
         ({"model": "hillaire"}, "model: got 'hillaire', expected a model"),
     ]:
         with pytest.raises(FitError, match=message):
