@@ -192,14 +192,21 @@ class Findings:
         return result
 
     @property
-    def whitened(self) -> list[Float[np.ndarray, "height width w"]]:
-        """(measured - fitted) / sigma of each image, NaN where a pixel was not used."""
+    def noise(self) -> list[Float[np.ndarray, "height width w"]]:
+        """The stated sigma of each image, of the light that was fitted; NaN where a pixel was not used."""
         result = []
         for observation, image in zip(self.observations, self.fitted, strict=True):
             noise = np.asarray(sigma(observation, image - self.pedestal(observation)))
-            off = (observation.image - image) / noise
-            result.append(np.where(observation.used[..., None], off, np.nan).astype(np.float32))
+            result.append(np.where(observation.used[..., None], noise, np.nan))
         return result
+
+    @property
+    def whitened(self) -> list[Float[np.ndarray, "height width w"]]:
+        """(measured - fitted) / sigma of each image, NaN where a pixel was not used."""
+        return [
+            ((observation.image - image) / noise).astype(np.float32)
+            for observation, image, noise in zip(self.observations, self.fitted, self.noise, strict=True)
+        ]
 
     def pedestal(self, observation: Observation) -> Float[np.ndarray, " w"]:
         """What was added to the light of an image that was fitted, for each channel."""

@@ -41,9 +41,9 @@
 ``images``            for each: place, sun as given, which nuisances are free, how many exposures it was merged
                       from, masked pixels by reason, pixels that a robust loss takes for outliers, ``colours`` (of red, green
                       and blue bands, how light at ``wavelengths_nm`` becomes pixels: ``response``, then ``factor``, then
-                      purity by the coefficient ``saturation``), and ``residuals``: per
-                      wavelength the median and the root mean square of measured / fitted - 1, the median of its absolute
-                      value, and the root mean square in sigmas
+                      purity by the coefficient ``saturation``), ``noise_relative`` (as stated: per wavelength the median of
+                      sigma / fitted), and ``residuals``: per wavelength the median and the root mean square of
+                      measured / fitted - 1, the median of its absolute value, and the root mean square in sigmas
 ``timings``           seconds: ``compile_s``, ``solve_s``, ``total_s``
 ====================  ================================================================================================
 """
@@ -336,6 +336,8 @@ def _image_record(result: Findings, number: int) -> dict[str, Any]:
     zenith, azimuth = _sun_degrees(observation)
     relative = result.residuals[number][observation.used].astype(float)
     whitened = result.whitened[number][observation.used].astype(float)
+    fitted = result.fitted[number][observation.used].astype(float)
+    stated = result.noise[number][observation.used] / np.where(fitted > 0, fitted, np.nan)
     return {
         "name": observation.name,
         "altitude_km": observation.altitude,
@@ -349,6 +351,7 @@ def _image_record(result: Findings, number: int) -> dict[str, Any]:
         "pixels_masked": observation.masked,
         "pixels_outlying": result.outliers[number] if result.outliers else 0,
         "binning": observation.block,
+        "noise_relative": np.median(stated, axis=0),
         "residuals": {
             "median_relative": np.median(relative, axis=0),
             "median_absolute_relative": np.median(np.abs(relative), axis=0),
@@ -438,15 +441,17 @@ def _residuals_text(
 ) -> str:
     """The residuals of an image in words: of each channel, or, of a spectrometer's many, of all of them."""
     relative, of_sigma = (np.asarray(about["residuals"][key]) for key in ("median_absolute_relative", "rms_sigma"))
+    noise = 100 * np.asarray(about["noise_relative"])
     told = f"Residuals: {residual_text(observation, relative, wavelengths)}"
     if relative.size > MANY:
         used = observation.used
         off = math.sqrt(np.mean((fitted - observation.image)[used].astype(float) ** 2))
         return (
             f"{told}; RMS {off:.2g} of a mean of {observation.image[used].mean(dtype=float):.2g} in the units of the "
-            f"measurement; over stated noise, RMS: {np.sqrt(np.mean(of_sigma**2)):.2g}."
+            f"measurement; over stated noise ({np.median(noise):.2g} %), RMS: {np.sqrt(np.mean(of_sigma**2)):.2g}."
         )
-    return f"{told}; over stated noise, RMS: {', '.join(f'{value:.2g}' for value in of_sigma)}."
+    over = ", ".join(f"{value:.2g}" for value in of_sigma)
+    return f"{told}; over stated noise ({', '.join(f'{value:.2g}' for value in noise)} %), RMS: {over}."
 
 
 def _caption(observation: Observation, fitted: np.ndarray, about: dict[str, Any], wavelengths: Sequence[float]) -> str:

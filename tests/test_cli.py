@@ -246,6 +246,7 @@ def test_fit_of_single_images(tmp_path, s1, start, toy, capfd):
     shown, errors = capfd.readouterr()
     assert errors == ""
     assert "step" in shown  # progress
+    assert "noise of 1 %" not in shown  # their headers say it
     assert "rayleigh_scattering" in shown  # the table
     assert f"Report: {out / 'report.html'}" in shown
     record = json.loads((out / "fit.json").read_text())
@@ -412,7 +413,7 @@ def test_fit_that_does_not_converge_is_written_all_the_same(tmp_path, s1, start,
     assert (out / "report.html").exists()
 
 
-def test_sun_is_found_in_the_picture(tmp_path, s1, start, toy):
+def test_sun_is_found_in_the_picture(tmp_path, s1, start, toy, capfd):
     camera = Equirectangular(32, 64)
     towards = sun.direction(zenith=0.9, azimuth=2.0)
     view = camera.directions()
@@ -424,7 +425,9 @@ def test_sun_is_found_in_the_picture(tmp_path, s1, start, toy):
     described += ["--sun-exclusion-deg", "8", "--view-zenith-max-deg", "90"]
     arguments = ["fit", str(tmp_path / "sky.exr"), "--init", start, *TOY_FREE, *described, "-o", str(tmp_path / "out")]
     assert main(arguments) == 0
+    assert "sky: noise of 1 % of the light, as nothing says what it is: --noise" in capfd.readouterr().out
     (record,) = json.loads((tmp_path / "out" / "fit.json").read_text())["images"]
+    assert record["noise_relative"] == pytest.approx([0.01] * 3, rel=0.02)
     assert record["sun_zenith_deg"] == pytest.approx(math.degrees(0.9), abs=3)
     assert record["sun_azimuth_deg"] == pytest.approx(math.degrees(2.0), abs=3)
 

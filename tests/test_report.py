@@ -61,6 +61,7 @@ def test_record(written):
     assert np.shape(data["covariance"]["matrix"]) == np.shape(data["correlation"]["matrix"]) == (size, size)
     assert [image["name"] for image in data["images"]] == ["sun 30", "sun 60", "sun 80"]
     assert data["images"][1]["sun_zenith_deg"] == pytest.approx(60, abs=1e-3)
+    assert data["images"][0]["noise_relative"] == pytest.approx([0.01] * 3, rel=0.05)
     assert data["images"][0]["residuals"]["rms_sigma"] == pytest.approx([1, 1, 1], abs=0.1)
     assert [step["step"] for step in data["history"]] == list(range(data["iterations"]))
     assert data["timings"].keys() == {"compile_s", "solve_s", "total_s"}
@@ -121,9 +122,10 @@ def test_what_was_merged_is_said():
 def test_residuals_of_many_channels_are_told_together():
     found = toy_sky.result()
     spread = {"median_absolute_relative": np.linspace(0.01, 0.03, 21), "rms_sigma": np.full(21, 0.5)}
-    page = report._residuals_text(found.observations[0], found.fitted[0], {"residuals": spread}, [])
+    about = {"residuals": spread, "noise_relative": np.full(21, 0.04)}
+    page = report._residuals_text(found.observations[0], found.fitted[0], about, [])
     assert page.startswith("Residuals: median |measured / fitted − 1| of a channel 2 %, at most 3 %; RMS ")
-    assert page.endswith("over stated noise, RMS: 0.5.")
+    assert page.endswith("over stated noise (4 %), RMS: 0.5.")
 
 
 def headlined(**changes):

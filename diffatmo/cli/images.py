@@ -306,7 +306,10 @@ def observe(opened: Opened, name: str, init: "Atmosphere") -> Seen:
         )
     except ValueError as error:
         raise InputError(f"{spec.file}: {str(error).removeprefix(f'{name}: ')}") from error
-    return Seen(observation, truth_of(shot, init) if shot else None, notes.get("model"), opened.told)
+    told = list(opened.told)
+    if noise is None and not any(key in chosen for key in NOISE_KEYS):
+        told.append(f"noise of 1 % of the light, as nothing says what it is: {flag_of('noise')}")
+    return Seen(observation, truth_of(shot, init) if shot else None, notes.get("model"), tuple(told))
 
 
 def order_of(image: "Image", init: "Atmosphere") -> "np.ndarray":
