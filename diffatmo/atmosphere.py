@@ -165,7 +165,7 @@ SPECTRAL = (
 )
 """Fields with one number per wavelength."""
 
-_POSITIVE = ("wavelengths", "bottom_radius", "rayleigh_scale_height", "mie_scale_height", "ozone_half_width")
+_POSITIVE = ("bottom_radius", "rayleigh_scale_height", "mie_scale_height", "ozone_half_width")
 _NOT_NEGATIVE = (
     "solar_irradiance",
     "rayleigh_scattering",
@@ -176,7 +176,10 @@ _NOT_NEGATIVE = (
 )
 
 
-_PHASE_NAMES = " or ".join(repr(name) for name in (*MIE_PHASES, TABULATED))
+_PHASE_NAMES = f"{' or '.join(map(repr, MIE_PHASES))}, or a table: a PhaseTable, in a file {TABULATED!r}"
+
+SHORTEST_NM, LONGEST_NM = 10.0, 1e6
+"""Wavelengths beyond which the unit is another one."""
 
 
 def _refuse(key: str, value: Any, expected: str) -> None:
@@ -208,6 +211,10 @@ def check(atmosphere: Atmosphere) -> None:
         values[name] = np.asarray(value)
         if not np.all(np.isfinite(values[name])):
             _refuse(name, values[name].tolist(), "finite numbers")
+    if "wavelengths" in values and not np.all(
+        (values["wavelengths"] >= SHORTEST_NM) & (values["wavelengths"] <= LONGEST_NM)
+    ):
+        _refuse("wavelengths", values["wavelengths"].tolist(), f"nm, from {SHORTEST_NM:g} to {LONGEST_NM:g}")
     for name in _POSITIVE:
         if name in values and np.any(values[name] <= 0):
             _refuse(name, values[name].tolist(), "numbers > 0")

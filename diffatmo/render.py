@@ -3,6 +3,7 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from diffatmo import geometry
@@ -36,10 +37,18 @@ RESOLVED = 20.0
 """Diameter of the sun in pixels from which its disc is evaluated pixel by pixel."""
 
 
+NOT_ONE = 1e-3
+"""What a unit vector's length may be off by."""
+
+
+class SceneError(ValueError):
+    """A scene that cannot be; the message says what would be right."""
+
+
 class Scene(eqx.Module):
     """All that a picture depends on: air, camera, its altitude (km), the unit vector to the sun, and the exposure.
 
-    Pixels are radiance times ``exposure``.
+    Pixels are radiance times ``exposure``. Raises :class:`SceneError` for a bad value (traced values are not looked at).
     """
 
     atmosphere: Atmosphere
@@ -47,6 +56,24 @@ class Scene(eqx.Module):
     altitude: Scalar = eqx.field(converter=array)
     sun: Direction = eqx.field(converter=array)
     exposure: Scalar = eqx.field(converter=array, default=1.0)
+
+    def __check_init__(self) -> None:
+        def refuse(name: str, expected: str) -> None:
+            raise SceneError(f"{name}: got {getattr(self, name).tolist()}, expected {expected}")
+
+        known = {
+            name: np.asarray(value)
+            for name, value in (("altitude", self.altitude), ("sun", self.sun), ("exposure", self.exposure))
+            if not isinstance(value, jax.core.Tracer)
+        }
+        if "altitude" in known and not np.all((known["altitude"] >= 0) & np.isfinite(known["altitude"])):
+            refuse("altitude", "kilometres >= 0")
+        if self.sun.shape[-1:] != (3,) or (
+            "sun" in known and not np.all(np.abs(np.linalg.norm(known["sun"], axis=-1) - 1) < NOT_ONE)
+        ):
+            refuse("sun", "a unit vector towards the sun, like that of diffatmo.sun.direction")
+        if "exposure" in known and not np.all((known["exposure"] > 0) & np.isfinite(known["exposure"])):
+            refuse("exposure", "a finite number > 0")
 
 
 @eqx.filter_jit

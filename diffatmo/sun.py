@@ -14,14 +14,26 @@ from diffatmo._types import Direction, Radiance, Scalar, Spectrum
 from diffatmo.constants import SUN_ANGULAR_RADIUS
 from diffatmo.numerics import safe_norm, safe_sqrt
 
+ROUNDING = 1e-6
+"""Of π in single precision."""
+
 
 class SunError(ValueError):
-    """A picture does not show one sun; the message says what it shows."""
+    """A picture does not show one sun, or a sun cannot be where it is said to be; the message says what is wrong."""
+
+
+def direction(*, zenith: float | Scalar, azimuth: float | Scalar) -> Direction:
+    """Unit vector (x east, y north, z up) towards a zenith angle and an azimuth clockwise from north, rad.
+
+    Raises :class:`SunError` for a zenith angle beyond π, which is one in degrees (traced values are not looked at).
+    """
+    if not isinstance(zenith, jax.core.Tracer) and np.any(np.abs(np.asarray(zenith)) > np.pi + ROUNDING):
+        raise SunError(f"zenith: got {np.asarray(zenith).tolist()}, expected radians, up to π")
+    return _direction(zenith, azimuth)
 
 
 @jax.jit
-def direction(*, zenith: float | Scalar, azimuth: float | Scalar) -> Direction:
-    """Unit vector (x east, y north, z up) towards a zenith angle and an azimuth clockwise from north, rad."""
+def _direction(zenith: float | Scalar, azimuth: float | Scalar) -> Direction:
     zenith, azimuth = jnp.asarray(zenith, jnp.result_type(float)), jnp.asarray(azimuth, jnp.result_type(float))
     sine = jnp.sin(zenith)
     return jnp.stack(jnp.broadcast_arrays(sine * jnp.sin(azimuth), sine * jnp.cos(azimuth), jnp.cos(zenith)), axis=-1)

@@ -264,6 +264,10 @@ def minimise(
     return best
 
 
+TELLING = 0.7
+"""Factor by which a distance shrinks in a step, above which nothing follows for the next ones: those far away are short."""
+
+
 def steps_left(history: list[Step], tolerance: float) -> int | None:
     """How many more steps a fit will take, if its distances go on to shrink as they did last; None while none can tell."""
     stage = history[-1].stage
@@ -276,6 +280,8 @@ def steps_left(history: list[Step], tolerance: float) -> int | None:
     if len(accepted) < 3 or not 0 < accepted[-1] < accepted[-3]:
         return None
     rate = math.sqrt(accepted[-1] / accepted[-3])
+    if rate > TELLING:
+        return None
     return math.ceil(math.log(aim / accepted[-1]) / math.log(rate)) + more
 
 

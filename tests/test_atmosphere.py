@@ -73,6 +73,7 @@ def test_toml_round_trip_in_double_precision(x64):
         ('"henyey-greenstein"', '"mie"', "cornette-shanks"),
         ('"henyey-greenstein"', "1", "mie_phase"),
         ("[680.0, 550.0, 440.0]", "[680.0, 550.0, 0.0]", "wavelengths_nm"),
+        ("[680.0, 550.0, 440.0]", "[0.68, 0.55, 0.44]", "expected nm, from 10 to 1e+06"),
         ("[680.0, 550.0, 440.0]", "[680.0", "not a TOML file"),
     ],
 )

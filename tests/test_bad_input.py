@@ -285,6 +285,7 @@ CASES = {
     "option without image": (["fit", "--noise", "0.1"], "--noise"),
     "option beside a scene": (["fit", "--config", "NOISE.scene", "--altitude-km", "1"], "--altitude-km"),
     "negative noise": (["fit", "GOOD.exr", "--noise", "-0.1"], "--noise"),
+    "noise in percent": (["fit", "GOOD.exr", "--noise", "5"], "--noise: got 5.0, expected a number from 0 to 1"),
     "no noise": (["fit", "GOOD.exr", "--noise", "0", "--noise-floor", "0"], "noise"),
     "no steps": (["fit", "GOOD.exr", "--max-steps", "0"], "--max-steps"),
     "fit by path tracing": (["fit", "GOOD.exr", "--model", "pathtrace"], "pathtrace"),

@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import tifffile
 from few_programs import radiance
 
 from diffatmo import atmosphere, imageio, models, scene, sun
@@ -430,6 +431,23 @@ def test_sun_is_found_in_the_picture(tmp_path, s1, start, toy, capfd):
     assert record["noise_relative"] == pytest.approx([0.01] * 3, rel=0.02)
     assert record["sun_zenith_deg"] == pytest.approx(math.degrees(0.9), abs=3)
     assert record["sun_azimuth_deg"] == pytest.approx(math.degrees(2.0), abs=3)
+
+
+def test_clipped_pixels_of_a_16_bit_picture_are_left_out(tmp_path, s1, start, toy):
+    camera, towards = Equirectangular(16, 32, upper=True), sun.direction(zenith=0.7, azimuth=1.0)
+    radiance = ToySky(s1).radiance(altitude=jnp.asarray(0.1), view=camera.directions(), sun=towards).radiance
+    white = np.quantile(np.max(radiance, axis=-1), 0.9)
+    counts = np.round(65535 * np.minimum(radiance / white, 1)).astype(np.uint16)
+    tifffile.imwrite(tmp_path / "sky.tif", counts, photometric="rgb")
+    clipped = int(np.sum(np.max(radiance, axis=-1) >= 0.98 * white))
+    described = ["--projection", "equirectangular", "--upper", "--altitude-km", "0.1", "--exposure", "free"]
+    described += ["--sun-zenith-deg", f"{math.degrees(0.7)}", "--sun-azimuth-deg", f"{math.degrees(1.0)}"]
+    described += ["--sun-exclusion-deg", "0", "--transfer", "linear"]
+    arguments = ["fit", str(tmp_path / "sky.tif"), "--init", start, *TOY_FREE, *described, "-o", str(tmp_path / "out")]
+    assert main(arguments) == 0
+    record = json.loads((tmp_path / "out" / "fit.json").read_text())
+    assert record["images"][0]["pixels_masked"] == {"saturated": clipped}
+    assert record["parameters"]["mie_g"]["value"] == pytest.approx(0.8, abs=0.001)
 
 
 def test_mask_leaves_out_black_pixels(tmp_path, s1, start, toy):

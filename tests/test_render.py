@@ -59,6 +59,28 @@ def answer(shot, model):
     return sky.radiance(altitude=shot.altitude, view=shot.camera.directions(), sun=shot.sun)
 
 
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"sun": jnp.array([0.0, 0.0, 1.05])}, "^sun: got .*1.049.*, expected a unit vector"),
+        ({"sun": jnp.array([0.6, 0.8])}, "^sun: .* unit vector"),
+        ({"sun": jnp.full(3, jnp.nan)}, "^sun: .* unit vector"),
+        ({"altitude": -1.0}, "^altitude: got -1.0, expected kilometres >= 0"),
+        ({"exposure": 0.0}, "^exposure: got 0.0, expected a finite number > 0"),
+    ],
+)
+def test_a_scene_that_cannot_be_is_refused(s1, values, message):
+    good = {"altitude": 0.1, "sun": sun.direction(zenith=1.0, azimuth=0.0)}
+    with pytest.raises(render.SceneError, match=message):
+        Scene(s1, Equirectangular(4, 8), **(good | values))
+
+
+def test_scenes_are_made_inside_transformations(s1):
+    suns = jax.vmap(lambda zenith: sun.direction(zenith=zenith, azimuth=0.0))(jnp.linspace(0, 1, 3))
+    scenes = jax.vmap(lambda towards: Scene(s1, Equirectangular(4, 8), 0.1, towards))(suns)
+    np.testing.assert_array_equal(scenes.sun, suns)
+
+
 def test_pixels_are_the_models_radiance_times_exposure(s1, lens):
     shot = make_scene(s1, lens, exposure=2.5)
     expected = np.where(lens.valid()[..., None], 2.5 * answer(shot, Haze()).radiance, 0)

@@ -456,4 +456,5 @@ def test_the_steps_that_are_left():
     assert steps_left(history([50, 25, 12.5], stage=1), 0.1) == 4 + 4
     assert steps_left(history([50, 25, 0.05], stage=3), 0.1) == 0
     assert steps_left(history([50, 60, 70], stage=1), 0.1) is None
+    assert steps_left(history([50, 45, 40], stage=1), 0.1) is None
     assert steps_left(history([50, 25], stage=1), 0.1) is None

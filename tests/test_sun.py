@@ -31,6 +31,12 @@ def test_direction_and_angles():
     np.testing.assert_allclose(back, [zenith, azimuth], atol=3e-6)
 
 
+def test_a_zenith_angle_in_degrees_is_refused():
+    with pytest.raises(sun.SunError, match=r"zenith: got 50\.0, expected radians"):
+        sun.direction(zenith=50.0, azimuth=0.0)
+    np.testing.assert_allclose(sun.direction(zenith=jnp.float32(np.pi), azimuth=0.0), [0, 0, -1], atol=1e-6)
+
+
 def test_angles_have_a_derivative_at_the_zenith():
     jacobian = jax.jacfwd(lambda v: jnp.stack(sun.angles(v)))(jnp.array([0.0, 0.0, 1.0]))
     assert np.isfinite(jacobian).all()

@@ -12,6 +12,7 @@ from diffatmo.cli.keys import CAMERA_KEYS, flag_of, make_camera, with_sun
 from diffatmo.cli.photo import (
     GLOW_ERROR_DEG,
     MAX_PIXELS,
+    SATURATION,
     SUN_SEEN,
     channels,
     check_colour,
@@ -293,6 +294,8 @@ def observe(opened: Opened, name: str, init: "Atmosphere") -> Seen:
         camera, altitude = find_camera(options, pixels, shot), find_altitude(options, shot)
         notes = shot.notes if shot else {}
         chosen = {key: notes[key] for key in NOISE_KEYS if key in notes} | stated(options)
+        if image.saturation is not None:
+            chosen.setdefault("saturation", SATURATION * image.saturation)
         observation = fitting.observe(
             pixels,
             camera=camera,

@@ -72,10 +72,14 @@ IMAGE_KEYS: dict[str, Key] = {
     "aerosol_error": Number("Standard deviation of the logarithm of that factor.  [default: 0.3]", 0, 1, positive=True),
     "aerosol_memory_h": Number("Hours in which the aerosol changes.  [default: 6]", 0, positive=True),
     "time_h": Number("Hours from any moment that all images share; for the aerosol's change."),
-    "noise": Number("Relative standard deviation per pixel and channel.  [default: 0.01]", 0, 10),
+    "noise": Number("Relative standard deviation per pixel and channel.  [default: 0.01]", 0, 1),
     "noise_shot": Number("Variance per unit of signal (photon noise).  [default: 0]", 0, 1e30),
     "noise_floor": Number("Standard deviation of a dark pixel (read noise).  [default: 1e-4 of the median]", 0, 1e30),
-    "saturation": Number("Leave out pixels with a channel at or above this value.", 0, positive=True),
+    "saturation": Number(
+        "Leave out pixels with a channel at or above this value.  [default: 0.98 of what the file can hold]",
+        0,
+        positive=True,
+    ),
     "view_zenith_max_deg": Number(
         "Use pixels up to this zenith angle: 90 the sky, 180 the ground too.  [default: 90]", 0, 180, True
     ),
