@@ -14,6 +14,7 @@ from diffatmo.atmosphere import earth
 from diffatmo.models.moments import Moments
 from diffatmo.models.moments.angular import azimuthal, norms, orders, pairs, plane, polar
 from diffatmo.models.moments.shell import Directions
+from diffatmo.models.pathtrace import PathTrace
 from diffatmo.models.raymarch import RayMarch
 
 
@@ -55,6 +56,21 @@ def test_scene_s1_against_successive_orders(shared, s1):
     got = viewed(solved(Moments(), s1), 0.5, directions(zenith, azimuth), directions(60, 0.0)).radiance
     error = np.asarray(got) / np.moveaxis(truth["radiance"], 0, -1) - 1
     assert np.sqrt(np.mean(error**2)) < 2.5e-3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sun_zenith_deg", [30.0, 45.0])
+def test_the_surroundings_of_the_sun_in_peaked_haze_against_monte_carlo(sun_zenith_deg):
+    """With g = 0.9 and an optical depth of 0.06, from 5° to 30° off the sun; nodes of the sun's height that are 30° apart are
+    off by 8 % there. The Monte Carlo's own error is 0.2 to 0.3 %."""
+    hazy = replace(earth(), mie_g=0.9, mie_scattering=jnp.full(3, 0.05))
+    off = np.array([-30.0, -20, -10, -5, 5, 10, 20, 30])
+    view, sun = (
+        directions(np.abs(sun_zenith_deg + off), np.where(sun_zenith_deg + off < 0, 180, 0)),
+        directions(sun_zenith_deg, 0),
+    )
+    truth = PathTrace(samples=4096).sky(hazy).radiance(altitude=0.1, view=view, sun=sun).radiance
+    np.testing.assert_allclose(viewed(solved(Moments(), hazy), 0.1, view, sun).radiance, truth, rtol=0.035)
 
 
 @pytest.mark.parametrize("altitude", [0.001, 0.5, 12.0, 300.0])

@@ -41,7 +41,7 @@ class Moments(Model):
     """
 
     altitudes: int = 16
-    suns: int = 24
+    suns: int = 28
     first: Directions = Directions(sky=12, ground=6, azimuths=5, steps=8, degree=10)
     iterate: Directions = Directions(sky=5, ground=4, azimuths=4, steps=5, degree=3)
     last: Directions = Directions(sky=8, ground=5, azimuths=7, steps=5, degree=8)
@@ -70,7 +70,7 @@ class Moments(Model):
         """Twice as fast, and off by 0.5 % RMS by day and at dusk: for photographs, which are known no better."""
         return cls(
             altitudes=12,
-            suns=16,
+            suns=18,
             first=Directions(sky=8, ground=4, azimuths=5, steps=6, degree=8),
             iterate=Directions(sky=5, ground=3, azimuths=4, steps=4, degree=3),
             last=Directions(sky=6, ground=4, azimuths=6, steps=4, degree=6),
@@ -89,7 +89,7 @@ class Moments(Model):
 
         return Moments(
             altitudes=7 * self.altitudes // 4,
-            suns=5 * self.suns // 3,
+            suns=3 * self.suns // 2,
             first=more(self.first),
             iterate=more(self.iterate),
             last=more(self.last),

@@ -24,6 +24,10 @@ DIRECTION_LINEAR = 0.02
 GRAZING = 0.05
 """sqrt(2 * 8 km / 6360 km): the sine of the sun's height over which the sky changes at dusk. Scales with the planet."""
 
+HIGH_SUN = 1.4
+"""Square of the poles of the map of sun heights. The moments of a phase function with a peak are polynomials of a high degree
+in mu_s, which change fastest towards the zenith: there the nodes have to be close in angle."""
+
 
 class Directions(NamedTuple):
     """How finely the sphere of directions is sampled, and the rays into it."""
@@ -116,12 +120,23 @@ def grazing(radius: Scalar, top: Altitude) -> Scalar:
     return jnp.sqrt(2 * 0.08 * top / radius)
 
 
+def _along_suns(mu_s: Cosine, scale: Scalar) -> Float[Array, "..."]:
+    """A coordinate in which sun nodes are equidistant: close at the horizon, on the ``scale`` of dusk, and at the zenith."""
+    return arcsinh(mu_s / (1 - mu_s * mu_s / HIGH_SUN) / scale)
+
+
+def _sun_at(along: Float[Array, "..."], scale: Scalar) -> Cosine:
+    """The inverse of :func:`_along_suns`."""
+    bent = scale * jnp.sinh(along)
+    return 2 * bent / (1 + jnp.sqrt(1 + 4 / HIGH_SUN * bent * bent))
+
+
 def sun_range(radius: Scalar, top: Altitude) -> tuple[Scalar, Scalar]:
-    """Ends of the sun nodes in arcsinh(mu_s / grazing): from 18° and the dip of the top's horizon below, to 10° off zenith."""
+    """Ends of the sun nodes in their coordinate: from 18° and the dip of the top's horizon below, to 10° off zenith."""
     scale = grazing(radius, top)
     dip = jnp.arctan(-geometry.horizon_mu(top, radius) / safe_divide(radius, radius + top))
     lowest = -jnp.sin(jnp.minimum(jnp.radians(18.0) + dip, jnp.radians(80.0)))
-    return arcsinh(lowest / scale), arcsinh(0.985 / scale)
+    return _along_suns(lowest, scale), _along_suns(jnp.asarray(0.985, scale.dtype), scale)
 
 
 def altitude_unit(altitude: Altitude, top: Altitude) -> Float[Array, "..."]:
@@ -132,7 +147,7 @@ def altitude_unit(altitude: Altitude, top: Altitude) -> Float[Array, "..."]:
 def sun_unit(mu_s: Cosine, radius: Scalar, top: Altitude) -> Float[Array, "..."]:
     """Unit coordinate of a sun height; not below 0, where the sky is dark."""
     low, high = sun_range(radius, top)
-    return once(jnp.maximum((arcsinh(mu_s / grazing(radius, top)) - low) / (high - low), 0))
+    return once(jnp.maximum((_along_suns(mu_s, grazing(radius, top)) - low) / (high - low), 0))
 
 
 def dusk(mu_s: Cosine, scale: Scalar) -> Float[Array, "..."]:
@@ -290,7 +305,7 @@ def build(
     altitude = once(top_altitude * table.stretch(jnp.linspace(0, 1, altitudes), ALTITUDE_LINEAR))
     low, high = sun_range(bottom_radius, top_altitude)
     scale = grazing(bottom_radius, top_altitude)
-    mu_s = once(scale * jnp.sinh(jnp.linspace(0, 1, suns) * (high - low) + low))
+    mu_s = once(_sun_at(jnp.linspace(0, 1, suns) * (high - low) + low, scale))
     counts = first, iterate, last
     bundle = _Bundle.trace(altitude, bottom_radius, top_altitude, counts)
     first_rays, *sets = _rays(altitude, mu_s, bottom_radius, bundle, counts)
