@@ -36,7 +36,6 @@ def _rows(camera: Camera, model: Model | None, pixels: int) -> int:
 RESOLVED = 20.0
 """Diameter of the sun in pixels from which its disc is evaluated pixel by pixel."""
 
-
 NOT_ONE = 1e-3
 """What a unit vector's length may be off by."""
 
@@ -58,22 +57,15 @@ class Scene(eqx.Module):
     exposure: Scalar = eqx.field(converter=array, default=1.0)
 
     def __check_init__(self) -> None:
-        def refuse(name: str, expected: str) -> None:
-            raise SceneError(f"{name}: got {getattr(self, name).tolist()}, expected {expected}")
-
-        known = {
-            name: np.asarray(value)
-            for name, value in (("altitude", self.altitude), ("sun", self.sun), ("exposure", self.exposure))
-            if not isinstance(value, jax.core.Tracer)
-        }
-        if "altitude" in known and not np.all((known["altitude"] >= 0) & np.isfinite(known["altitude"])):
-            refuse("altitude", "kilometres >= 0")
-        if self.sun.shape[-1:] != (3,) or (
-            "sun" in known and not np.all(np.abs(np.linalg.norm(known["sun"], axis=-1) - 1) < NOT_ONE)
+        unit = lambda v: v.shape[-1:] == (3,) and np.abs(np.linalg.norm(v, axis=-1) - 1) < NOT_ONE
+        for name, good, expected in (
+            ("altitude", lambda km: (km >= 0) & np.isfinite(km), "kilometres >= 0"),
+            ("sun", unit, "a unit vector towards the sun, like that of diffatmo.sun.direction"),
+            ("exposure", lambda factor: (factor > 0) & np.isfinite(factor), "a finite number > 0"),
         ):
-            refuse("sun", "a unit vector towards the sun, like that of diffatmo.sun.direction")
-        if "exposure" in known and not np.all((known["exposure"] > 0) & np.isfinite(known["exposure"])):
-            refuse("exposure", "a finite number > 0")
+            value = getattr(self, name)
+            if not isinstance(value, jax.core.Tracer) and not np.all(good(np.asarray(value))):
+                raise SceneError(f"{name}: got {value.tolist()}, expected {expected}")
 
 
 @eqx.filter_jit

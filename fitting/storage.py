@@ -83,7 +83,7 @@ def load(path: str | Path, kind: type[F]) -> F:
     """
     try:
         with Path(path).open("rb") as file:
-            if not zipfile.is_zipfile(file):
+            if not zipfile.is_zipfile(path):
                 raise FitError(f"{path}: not a saved fit, or one that is cut short; expected a file of FitResult.save")
             archive = np.load(file, allow_pickle=False)
             if not isinstance(archive, Mapping) or RECORD not in archive:
