@@ -41,7 +41,7 @@ class Moments(Model):
     """
 
     altitudes: int = 16
-    suns: int = 28
+    suns: int = 24
     first: Directions = Directions(sky=12, ground=6, azimuths=5, steps=8, degree=10)
     iterate: Directions = Directions(sky=5, ground=4, azimuths=4, steps=5, degree=3)
     last: Directions = Directions(sky=8, ground=5, azimuths=7, steps=5, degree=8)
@@ -89,7 +89,7 @@ class Moments(Model):
 
         return Moments(
             altitudes=7 * self.altitudes // 4,
-            suns=3 * self.suns // 2,
+            suns=5 * self.suns // 3,
             first=more(self.first),
             iterate=more(self.iterate),
             last=more(self.last),

@@ -24,7 +24,7 @@ DIRECTION_LINEAR = 0.02
 GRAZING = 0.05
 """sqrt(2 * 8 km / 6360 km): the sine of the sun's height over which the sky changes at dusk. Scales with the planet."""
 
-HIGH_SUN = 1.4
+HIGH_SUN = 1.6
 """Square of the poles of the map of sun heights. The moments of a phase function with a peak are polynomials of a high degree
 in mu_s, which change fastest towards the zenith: there the nodes have to be close in angle."""
 
