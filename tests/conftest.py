@@ -14,7 +14,9 @@ import matplotlib
 import numpy as np
 import pytest
 from few_programs import COMPILE_FAST
+from quick_sky import Toy
 
+from diffatmo import models
 from diffatmo.atmosphere import Atmosphere
 
 matplotlib.use("Agg")
@@ -98,6 +100,13 @@ def s1() -> Atmosphere:
         ozone_absorption=jnp.zeros(3),
         ground_albedo=jnp.full(3, 0.3),
     )
+
+
+@pytest.fixture
+def toy(monkeypatch):
+    """Commands find a sky of a few operations where the models were."""
+    for name in ("moments", "raymarch"):
+        monkeypatch.setitem(models.MODELS, name, Toy)
 
 
 @pytest.fixture(scope="session")

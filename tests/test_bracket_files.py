@@ -11,7 +11,7 @@ import photographs
 import pytest
 import tifffile
 from PIL import Image as Pillow
-from test_cli import TOY_FREE, Toy
+from quick_sky import TOY_FREE, Toy
 
 from diffatmo import brackets, color, imageio, models, scene, sun
 from diffatmo.atmosphere import earth, save

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 import stub_fit
 import toy_fit
-from test_cli import toy_image
+from quick_sky import toy_image
 
 from diffatmo import atmosphere, folders, imageio
 from diffatmo.cli import many, origin, results, workers

@@ -1,7 +1,7 @@
 """Fits of a quick model by the processes of a run over many images: what a process needs is what it can import."""
 
 import jax
-from test_cli import Toy
+from quick_sky import Toy
 
 from diffatmo import models
 from diffatmo.cli import running
