@@ -238,12 +238,18 @@ def test_thin_shells_and_far_observers_are_finite():
         assert all(bool(jnp.isfinite(slope).all()) for slope in slopes), place
 
 
-def test_a_series_needs_orders():
-    with pytest.raises(ValueError, match="order: got 3, expected at least 4"):
-        replace(QUICK, order=3)
-
-
-def test_rays_that_are_followed_together_have_as_many_steps():
-    directions = Directions(sky=5, ground=4, azimuths=4, steps=6, degree=3)
-    with pytest.raises(ValueError, match=r"iterate and last: .* 6 and 5 steps; expected as many"):
-        Moments(iterate=directions)
+@pytest.mark.parametrize(
+    ("resolution", "message"),
+    [
+        ({"order": 3}, "order: got 3, expected at least 4"),
+        ({"suns": 0}, "suns: got 0, expected at least 1"),
+        ({"view_sky": 0}, "view_sky: got 0, expected at least 1"),
+        ({"first": Directions(0, 6, 5, 8, 10)}, r"first: got Directions\(sky=0, .* expected at least 1 of each"),
+        ({"iterate": Directions(5, 4, 4, 6, 3)}, "iterate and last: .* 6 and 5 steps; expected as many"),
+        ({"source_degree": 2}, r"iterate\.degree: got 3, expected at most source_degree, which is 2"),
+        ({"last": Directions(8, 5, 7, 5, 12)}, r"last\.degree: got 12, expected at most first\.degree, which is 10"),
+    ],
+)
+def test_resolutions_that_do_not_fit_together_are_refused(resolution, message):
+    with pytest.raises(ValueError, match=message):
+        Moments(**resolution)

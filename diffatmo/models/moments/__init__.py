@@ -59,11 +59,25 @@ class Moments(Model):
             raise ValueError(
                 f"order: got {self.order}, expected at least 4, from which on the rest is a geometric series"
             )
+        for name in ("altitudes", "suns", "peak_azimuths", *(name for name in vars(self) if name.startswith("view_"))):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name}: got {getattr(self, name)}, expected at least 1")
+        for name in ("first", "iterate", "last"):
+            given = getattr(self, name)
+            if min(given[:-1]) < 1 or given.degree < 0:
+                raise ValueError(f"{name}: got {given}, expected at least 1 of each, and a degree of at least 0")
         if self.iterate.steps != self.last.steps:
             raise ValueError(
                 f"iterate and last: their rays are followed together, with {self.iterate.steps} and {self.last.steps} steps; "
                 "expected as many"
             )
+        # What a step takes up has to be what the step before it made.
+        for low, small, high, large in (
+            ("iterate.degree", self.iterate.degree, "source_degree", self.source_degree),
+            ("last.degree", self.last.degree, "first.degree", self.first.degree),
+        ):
+            if small > large:
+                raise ValueError(f"{low}: got {small}, expected at most {high}, which is {large}")
 
     @classmethod
     def coarse(cls) -> "Moments":
