@@ -4,7 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from diffatmo import geometry
 from diffatmo import sun as sunlight
@@ -84,28 +84,42 @@ def render(
     """
     sky = (model or Moments()).sky(scene.atmosphere)
     view = sky.view(altitude=scene.altitude, sun=scene.sun)
-    resolved = 2 * sun_angular_radius > RESOLVED * scene.camera.pixel_angle
 
     def tile(directions: Float[Array, "columns 3"]) -> Float[Array, "columns w"]:
         ray = view.radiance(view=directions)
         if not sun_disc:
             return ray.radiance
-        disc = sunlight.disc_radiance(
-            view=directions,
-            sun=scene.sun,
-            irradiance=scene.atmosphere.solar_irradiance,
-            wavelengths=scene.atmosphere.wavelengths,
-            angular_radius=sun_angular_radius,
-        )
-        return ray.radiance + jnp.where(resolved, disc * _clear(scene, directions, ray.transmittance), 0)
+        return ray.radiance + _large_sun(scene, directions, ray.transmittance, sun_angular_radius)
 
     directions = scene.camera.directions()
     rows = _rows(scene.camera, model, TILE_PIXELS)
     whole = rows == scene.camera.height
     picture = tile(directions) if whole else jax.lax.map(tile, directions, batch_size=rows)
     if sun_disc:
-        picture = picture + jnp.where(resolved, 0, _small_sun(scene, view, sun_angular_radius))
-    return jnp.where(scene.camera.valid()[..., None], scene.exposure * picture, 0)
+        picture = picture + _small_sun(scene, view, sun_angular_radius)
+    return _exposed(scene, picture)
+
+
+@eqx.filter_jit
+def render_with_error(
+    scene: Scene,
+    model: PathTrace,
+    *,
+    sun_disc: bool = False,
+    sun_angular_radius: float | Scalar = SUN_ANGULAR_RADIUS,
+) -> tuple[Float[Array, "height width w"], Float[Array, "height width w"]]:
+    """The picture that :func:`render` makes by the path tracer, and the Monte Carlo's standard error of every pixel of it."""
+    sky = model.sky(scene.atmosphere)
+    directions = scene.camera.directions()
+    picture, error, transmittance = sky.radiance_with_error(altitude=scene.altitude, view=directions, sun=scene.sun)
+    if sun_disc:
+        picture = picture + _large_sun(scene, directions, transmittance, sun_angular_radius)
+        picture = picture + _small_sun(scene, sky.view(altitude=scene.altitude, sun=scene.sun), sun_angular_radius)
+    return _exposed(scene, picture), _exposed(scene, error)
+
+
+def _exposed(scene: Scene, light: Float[Array, "height width w"]) -> Float[Array, "height width w"]:
+    return jnp.where(scene.camera.valid()[..., None], scene.exposure * light, 0)
 
 
 @eqx.filter_jit
@@ -146,6 +160,24 @@ def _clear(scene: Scene, directions: Direction, transmittance: Radiance) -> Radi
     return jnp.where(ground[..., None], 0, transmittance)
 
 
+def _is_resolved(scene: Scene, angular_radius: float | Scalar) -> Bool[Array, ""]:
+    return jnp.asarray(2 * angular_radius > RESOLVED * scene.camera.pixel_angle)
+
+
+def _large_sun(
+    scene: Scene, directions: Direction, transmittance: Radiance, angular_radius: float | Scalar
+) -> Radiance:
+    """Radiance of the sun's disc along ``directions``; 0 where pixels are too large to show it."""
+    disc = sunlight.disc_radiance(
+        view=directions,
+        sun=scene.sun,
+        irradiance=scene.atmosphere.solar_irradiance,
+        wavelengths=scene.atmosphere.wavelengths,
+        angular_radius=angular_radius,
+    )
+    return jnp.where(_is_resolved(scene, angular_radius), disc * _clear(scene, directions, transmittance), 0)
+
+
 def _small_sun(scene: Scene, view: View, angular_radius: float | Scalar) -> Float[Array, "height width w"]:
     """Radiance the sun adds to pixels that do not resolve it: each point's light goes to the four pixels around it."""
     camera, air = scene.camera, scene.atmosphere
@@ -163,4 +195,4 @@ def _small_sun(scene: Scene, view: View, angular_radius: float | Scalar) -> Floa
             y = jnp.clip(row + down, 0, camera.height - 1)
             share = jnp.prod(jnp.abs(fraction - jnp.array([1 - right, 1 - down])), axis=-1)
             picture = picture.at[y, x].add(light * share[:, None])
-    return picture / camera.solid_angles()[..., None]
+    return jnp.where(_is_resolved(scene, angular_radius), 0, picture / camera.solid_angles()[..., None])

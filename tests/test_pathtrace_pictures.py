@@ -18,7 +18,8 @@ import pytest
 from scipy import stats
 
 import diffatmo
-from diffatmo import sun
+from diffatmo import render, sun
+from diffatmo.cli.main import main
 from diffatmo.models import Moments, PathTrace
 
 ALTITUDE = jnp.asarray(0.5)
@@ -133,3 +134,30 @@ def test_another_asymmetry_does_not_pass(s1, traced, g):
     print(f"g = {g} for 0.8: mean z {verdict.mean:+.2f}, χ²/n {verdict.scatter:.1f}, largest |z| {verdict.largest:.1f}")
     assert verdict.scatter > 2 * verdict.scatter_limits[1]
     assert verdict.largest > 2 * verdict.largest_limit
+
+
+def test_a_picture_comes_with_its_standard_error(s1):
+    """The same picture as without; both in the exposure; light of the sun's disc, which is not sampled, adds no error."""
+    shot = diffatmo.Scene(s1, CAMERA, 0.5, towards(60), 3.0)
+    model = PathTrace(samples=32)
+    picture, error = render.render_with_error(shot, model)
+    np.testing.assert_allclose(picture, render.render(shot, model), rtol=1e-6)
+    dimmer = eqx.tree_at(lambda s: s.exposure, shot, jnp.asarray(1.0))
+    np.testing.assert_allclose(error, 3 * render.render_with_error(dimmer, model)[1], rtol=1e-6)
+    disc, same = render.render_with_error(shot, model, sun_disc=True)
+    np.testing.assert_array_equal(same, error)
+    np.testing.assert_allclose(disc, render.render(shot, model, sun_disc=True), rtol=1e-6)
+    assert float(disc.sum()) > 2 * float(picture.sum())
+
+
+def test_the_header_of_a_picture_tells_a_fit_its_noise(tmp_path):
+    """It is what another seed differs by, over √2: 1536 numbers in whose squares the noise differs by some ten."""
+    found = []
+    for seed in ("1", "2"):
+        command = ["render", "mars", "--model", "pathtrace", "--samples", "64", "--width", "32", "--seed", seed]
+        assert main([*command, "-o", str(tmp_path / f"{seed}.exr")]) == 0
+        found.append(diffatmo.scene.load(tmp_path / f"{seed}.exr"))
+    one, other = found
+    assert (one.notes["samples"], one.notes["seed"]) == (64, 1)
+    apart = 2 * (one.pixels - other.pixels) / (one.pixels + other.pixels)
+    assert one.notes["noise"] == pytest.approx(np.sqrt(np.mean(apart**2) / 2), rel=0.15)

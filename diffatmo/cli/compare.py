@@ -10,7 +10,7 @@ from diffatmo import folders
 from diffatmo.cli import keys
 from diffatmo.cli.common import MODELS, InputError, make_console, make_model, overwrite_option, read_atmosphere, waiting
 from diffatmo.cli.keys import CAMERA_KEYS, PLACE_KEYS
-from diffatmo.cli.render import DEFAULTS, SIZE, make_scene
+from diffatmo.cli.render import DEFAULTS, SIZE, make_scene, noise_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -108,8 +108,9 @@ def compare(
             chosen = make_model(name, samples=samples if name == "pathtrace" else None)
             outcomes[name] = comparison.run(scene, chosen)
             # At once: the next model may take long, and may be interrupted.
-            path, notes = output / f"picture_{name}.exr", {"model": name}
-            scenes.save(path, outcomes[name].picture, scene, notes=notes, overwrite=True)
+            picture, error = outcomes[name].picture, outcomes[name].stderr
+            notes = {"model": name} | ({} if error is None else noise_of(picture, error))
+            scenes.save(output / f"picture_{name}.exr", picture, scene, notes=notes, overwrite=True)
     found = {name: comparison.errors(scene, outcome, outcomes[truth]) for name, outcome in outcomes.items()}
     paths = PathTrace(samples=samples).paths if "pathtrace" in names else None
     _write(output, scene, outcomes, found, truth, paths)

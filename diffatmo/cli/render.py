@@ -86,18 +86,30 @@ def render(
 
     from diffatmo import render
     from diffatmo.compiling import outermost
+    from diffatmo.models import PathTrace
 
     chosen = make_model(model, samples=samples, seed=seed)
     air = read_atmosphere(atmosphere)
     seen = None if colours is None else camera_colours.read(colours, air)
     scene = make_scene(air, options, width, height)
-    pixels = np.asarray(outermost(render.render)(scene, chosen, sun_disc=sun_disc))
+    notes: dict[str, Any] = {"model": model, "sun_disc": sun_disc}
+    if isinstance(chosen, PathTrace):
+        pixels, error = map(np.asarray, outermost(render.render_with_error)(scene, chosen, sun_disc=sun_disc))
+        notes |= {"samples": chosen.samples, "seed": chosen.seed} | noise_of(pixels, error)
+    else:
+        pixels = np.asarray(outermost(render.render)(scene, chosen, sun_disc=sun_disc))
     if seen is not None:
         for path in outputs:
             _write_seen(path, seen.develop(pixels), encoded=seen.encoded, automatic="exposure" not in given)
         return
     for path, write in writers:
-        write(path, pixels, scene, {"model": model, "sun_disc": sun_disc}, "exposure" not in given)
+        write(path, pixels, scene, notes, "exposure" not in given)
+
+
+def noise_of(pixels: "np.ndarray", error: "np.ndarray") -> dict[str, float]:
+    """What a fit of a picture by the path tracer is to know: the RMS relative standard error, where there is light."""
+    lit = pixels > 0
+    return {"noise": float(((error[lit] / pixels[lit]) ** 2).mean() ** 0.5)} if lit.any() else {}
 
 
 def make_scene(air: "Atmosphere", options: Mapping[str, Any], width: int | None, height: int | None) -> "Scene":
