@@ -15,6 +15,7 @@ import tomli_w
 from jaxtyping import Array, Float
 
 from diffatmo import constants, spectrum
+from diffatmo._names import did_you_mean
 from diffatmo._types import Altitude, Scalar, Spectrum
 from diffatmo.numerics import array
 from diffatmo.phase import MIE_PHASES, PhaseTable, Shape
@@ -186,6 +187,11 @@ def _refuse(key: str, value: Any, expected: str) -> None:
     raise AtmosphereError(f"{FILE_KEYS.get(key, key)}: got {value}, expected {expected}")
 
 
+def _listed(value: np.ndarray) -> Any:
+    """With as few digits as tell the number in its own precision."""
+    return np.reshape([float(str(x)) for x in value.flat], value.shape).tolist()
+
+
 def check(atmosphere: Atmosphere) -> None:
     """Raise :class:`AtmosphereError` unless every concrete value is in its range (traced values are not looked at)."""
     if not isinstance(atmosphere.mie_phase, PhaseTable) and atmosphere.mie_phase not in MIE_PHASES:
@@ -210,23 +216,27 @@ def check(atmosphere: Atmosphere) -> None:
             continue
         values[name] = np.asarray(value)
         if not np.all(np.isfinite(values[name])):
-            _refuse(name, values[name].tolist(), "finite numbers")
+            _refuse(name, _listed(values[name]), "finite numbers")
     if "wavelengths" in values and not np.all(
         (values["wavelengths"] >= SHORTEST_NM) & (values["wavelengths"] <= LONGEST_NM)
     ):
-        _refuse("wavelengths", values["wavelengths"].tolist(), f"nm, from {SHORTEST_NM:g} to {LONGEST_NM:g}")
+        _refuse("wavelengths", _listed(values["wavelengths"]), f"nm, from {SHORTEST_NM:g} to {LONGEST_NM:g}")
     for name in _POSITIVE:
         if name in values and np.any(values[name] <= 0):
-            _refuse(name, values[name].tolist(), "numbers > 0")
+            _refuse(name, _listed(values[name]), "numbers > 0")
     for name in _NOT_NEGATIVE:
         if name in values and np.any(values[name] < 0):
-            _refuse(name, values[name].tolist(), "numbers >= 0")
+            _refuse(name, _listed(values[name]), "numbers >= 0")
     if "ground_albedo" in values and np.any((values["ground_albedo"] < 0) | (values["ground_albedo"] > 1)):
-        _refuse("ground_albedo", values["ground_albedo"].tolist(), "numbers from 0 to 1")
+        _refuse("ground_albedo", _listed(values["ground_albedo"]), "numbers from 0 to 1")
     if "mie_g" in values and abs(float(values["mie_g"])) >= 1:
-        _refuse("mie_g", values["mie_g"].tolist(), "a number with -1 < g < 1")
+        _refuse("mie_g", _listed(values["mie_g"]), "a number with -1 < g < 1")
     if "top_radius" in values and "bottom_radius" in values and values["top_radius"] <= values["bottom_radius"]:
-        _refuse("top_radius", values["top_radius"].tolist(), f"more than bottom_radius_km = {values['bottom_radius']}")
+        _refuse(
+            "top_radius",
+            _listed(values["top_radius"]),
+            f"more than bottom_radius_km = {_listed(values['bottom_radius'])}",
+        )
 
 
 def _number(key: str, value: Any) -> float:
@@ -244,7 +254,8 @@ def from_dict(data: Mapping[str, Any]) -> Atmosphere:
     data, table = _take_table(data)
     unknown = sorted(set(data) - set(by_key))
     if unknown:
-        raise AtmosphereError(f"{unknown[0]}: unknown key; an atmosphere has the keys {', '.join(by_key)}")
+        hint = did_you_mean(unknown[0], list(by_key)) or ";"
+        raise AtmosphereError(f"{unknown[0]}: unknown key{hint} an atmosphere has the keys {', '.join(by_key)}")
     optional = ("ozone_center_altitude", "ozone_half_width", "mie_phase", *["mie_g"] * (table is not None))
     missing = [key for key, name in by_key.items() if key not in data and name not in optional]
     if missing:

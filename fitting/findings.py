@@ -12,9 +12,10 @@ from typing import Self
 import numpy as np
 from jaxtyping import Bool, Float
 
+from diffatmo._names import did_you_mean
 from diffatmo.atmosphere import Atmosphere
 from diffatmo.models import Model
-from fitting._errors import FitError, did_you_mean
+from fitting._errors import FitError
 from fitting.nuisances import channel_names, group_of
 from fitting.observation import Observation, sigma
 from fitting.priors import Prior

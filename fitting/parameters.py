@@ -29,11 +29,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from diffatmo import spectrum
+from diffatmo._names import did_you_mean
 from diffatmo.atmosphere import SPECTRAL, Atmosphere
 from diffatmo.compiling import outermost
 from diffatmo.numerics import array
 from diffatmo.phase import PhaseTable
-from fitting._errors import FitError, did_you_mean
+from fitting._errors import FitError
 from fitting.bijections import Bijection, Linear, Log, Logit
 from fitting.quantities import ALWAYS, REFERENCE_NM, derived_fields
 

@@ -32,12 +32,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from diffatmo import transmittance
+from diffatmo._names import did_you_mean
 from diffatmo.atmosphere import Atmosphere
 from diffatmo.camera import Camera, Fisheye, Pinhole
 from diffatmo.compiling import compile_ahead, outermost
 from diffatmo.models import Model, Moments
 from diffatmo.numerics import array, safe_log
-from fitting._errors import FitError, did_you_mean
+from fitting._errors import FitError
 from fitting.batch import Batch, stack
 from fitting.elimination import eliminate, starting, without
 from fitting.evaluation import check_finite, evaluated, pose

@@ -16,10 +16,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from diffatmo import constants, spectrum
+from diffatmo._names import did_you_mean
 from diffatmo.atmosphere import Atmosphere
 from diffatmo.compiling import outermost
 from diffatmo.numerics import array, safe_log
-from fitting._errors import FitError, did_you_mean, is_number
+from fitting._errors import FitError, is_number
 from fitting.parameters import Coordinates, Parameters
 from fitting.quantities import DERIVED, REFERENCE_NM, Quantity, numbers, quantities, spectral_name
 

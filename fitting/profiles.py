@@ -24,9 +24,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from diffatmo._names import did_you_mean
 from diffatmo.compiling import outermost
 from diffatmo.numerics import array
-from fitting._errors import FitError, did_you_mean
+from fitting._errors import FitError
 from fitting.evaluation import evaluated, restored
 from fitting.findings import Estimate, Profile
 from fitting.least_squares import known_rows, reduce

@@ -17,7 +17,7 @@ ROOT = Path(__file__).parent.parent
 # One row per level; a module may import from any earlier row, never from its own. A package's own name means its
 # __init__.py.
 LEVELS = [
-    ["diffatmo._types", "diffatmo.constants", "diffatmo.compiling", "diffatmo.folders"],
+    ["diffatmo._types", "diffatmo._names", "diffatmo.constants", "diffatmo.compiling", "diffatmo.folders"],
     ["diffatmo.numerics", "diffatmo.saturation", "diffatmo.features"],
     ["diffatmo.ephemeris", "diffatmo.horizon"],
     [

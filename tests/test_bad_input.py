@@ -301,8 +301,8 @@ CASES = {
     # scene files
     "no such scene": (["fit", "--config", "GONE.scene"], "GONE.scene"),
     "scene not TOML": (["fit", "--config", "TOML.scene"], "TOML"),
-    "unknown key of an image": (["fit", "--config", "UNKNOWN_KEY.scene"], "did you mean sun_zenith_deg"),
-    "unknown key of a scene": (["fit", "--config", "UNKNOWN_TOP.scene"], "did you mean free"),
+    "unknown key of an image": (["fit", "--config", "UNKNOWN_KEY.scene"], "did you mean 'sun_zenith_deg'"),
+    "unknown key of a scene": (["fit", "--config", "UNKNOWN_TOP.scene"], "did you mean 'free'"),
     "scene without images": (["fit", "--config", "NO_IMAGE.scene"], "[[image]]"),
     "image without file": (["fit", "--config", "NO_FILE.scene"], "image 1: file"),
     "image not a table": (["fit", "--config", "TABLE.scene"], "[[image]]"),
@@ -312,7 +312,7 @@ CASES = {
     "model without derivatives": (["fit", "--config", "MODEL.scene"], "model"),
     "no steps in a scene": (["fit", "--config", "STEPS.scene"], "max_steps"),
     "no starts in a scene": (["fit", "--config", "STARTS.scene"], "starts: got 0"),
-    "profile of no number": (["fit", "--config", "PROFILE.scene"], "did you mean mie_g"),
+    "profile of no number": (["fit", "--config", "PROFILE.scene"], "did you mean 'mie_g'"),
     "time without an offset in a scene": (
         ["fit", "--config", "TIME.scene"],
         "image 1: time: got 2024-06-21 12:00:00, expected a date and time with its offset from UTC",

@@ -328,7 +328,10 @@ def order_of(image: "Image", init: "Atmosphere") -> "np.ndarray":
         own = np.asarray(image.wavelengths, dtype=float)
         order = matching(own, wanted)
         if np.any(np.abs(own[order] - wanted) > SAME_WAVELENGTH_NM):
-            raise InputError(f"wavelengths {_list(own)}, but the atmosphere of the fit has {_list(wanted)}")
+            raise InputError(
+                f"wavelengths {_list(own)}, but the atmosphere of the fit has {_list(wanted)}; expected an init (--init) "
+                "with the wavelengths of the image"
+            )
     elif count == 3:
         # Red, green, blue: the longest wavelength first.
         order = matching(np.array([3, 2, 1]), wanted)

@@ -5,10 +5,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from diffatmo._names import did_you_mean
 from diffatmo.cli import photo, scans
 from diffatmo.cli.common import InputError, printable, read_atmosphere
 from diffatmo.cli.images import View, observe, observe_photo, open_image, stated
-from diffatmo.cli.scenefile import FREE, MODELS, FitSpec, ImageSpec, did_you_mean
+from diffatmo.cli.scenefile import FREE, MODELS, FitSpec, ImageSpec
 
 if TYPE_CHECKING:
     from diffatmo.atmosphere import Atmosphere
@@ -178,9 +179,9 @@ def check_profile(names: Sequence[str], parameters: "Parameters") -> tuple[str, 
     known = [*fields, *(quantity.name for quantity in quantities(fields, wavelengths))]
     for name in names:
         if name not in known:
+            hint = did_you_mean(name, [*known]) or ";"
             raise InputError(
-                f"profile: got {name!r}{did_you_mean(name, tuple(known))}; expected a number of this fit: {', '.join(fields)}, "
-                "with _<nm> for one wavelength"
+                f"profile: got {name!r}{hint} expected a number of this fit: {', '.join(fields)}, with _<nm> for one wavelength"
             )
     return tuple(names)
 

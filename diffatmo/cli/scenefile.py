@@ -1,12 +1,12 @@
 """What is to be fitted, as the user describes it: a scene file, or images with options."""
 
-import difflib
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from diffatmo._names import did_you_mean
 from diffatmo.cli.common import InputError
 from diffatmo.cli.keys import (
     CAMERA_KEYS,
@@ -304,10 +304,4 @@ def _prior(table: Mapping[str, Any]) -> Mapping[str, Any]:
 def _refuse_unknown(table: Mapping[str, Any], known: tuple[str, ...]) -> None:
     for key in table:
         if key not in known:
-            raise InputError(f"{key}: unknown key{did_you_mean(key, known)}; known are {', '.join(known)}")
-
-
-def did_you_mean(name: str, known: tuple[str, ...]) -> str:
-    """A hint at the nearest known name, or nothing."""
-    near = difflib.get_close_matches(name, known, n=1)
-    return f", did you mean {near[0]}?" if near else ""
+            raise InputError(f"{key}: unknown key{did_you_mean(key, known) or ';'} known are {', '.join(known)}")
