@@ -80,6 +80,9 @@ def main() -> None:
         changed = eqx.tree_at(lambda a: tuple(getattr(a, name) for name in NINE), air, fields)
         return model.sky(changed).view(altitude=0.1, sun=towards).radiance(view=view).radiance
 
+    def mean(x, view):
+        return image(x, view).mean()
+
     quickly = {"compiler_options": diffatmo.compiler_options()}
     upper = diffatmo.Equirectangular(64, 128, upper=True).directions()
     full = diffatmo.Equirectangular(128, 256).directions()
@@ -92,6 +95,7 @@ def main() -> None:
         ("the same, compiler_options()", jax.jit(image, **quickly), (x, full)),
         ("Jacobian of 128×64 in 9 parameters (5 tangents)", jax.jit(jax.jacfwd(image)), (x, upper)),
         ("the same, compiler_options()", jax.jit(jax.jacfwd(image), **quickly), (x, upper)),
+        ("reverse mode: gradient of its mean, compiler_options()", jax.jit(jax.grad(mean), **quickly), (x, upper)),
     ):
         first, median, least = timed(function, *arguments)
         table.add_row(what, f"{first:.1f}", f"{1e3 * median:.0f}", f"{1e3 * least:.0f}")
