@@ -122,7 +122,9 @@ def stack(observations: Sequence[Observation], wavelengths: Sequence[float], mes
     seen = Counter(observation.name for observation in observations)
     for name, count in seen.items():
         if count > 1:
-            raise FitError(f"{name}: the name of {count} observations, expected different names")
+            raise FitError(
+                f"{name}: the name of {count} observations, expected different ones, see fitting.observe(name=…)"
+            )
     for observation in observations:
         _check_channels(observation, observations[0], wavelengths)
     most, devices = max(int(observation.shown.sum()) for observation in observations), 1 if mesh is None else mesh.size

@@ -31,6 +31,7 @@ from fitting._errors import FitError, is_number
 FIXED = "fixed"
 FREE = "free"
 PER_CHANNEL = "-per-channel"
+UNNAMED = "image"
 
 NOISE = 0.01
 MAX_PIXELS = 20_000
@@ -139,7 +140,7 @@ def observe(
     max_pixels: int = MAX_PIXELS,
     bands: Bands | None = None,
     merged: int = 1,
-    name: str = "image",
+    name: str = UNNAMED,
 ) -> Observation:
     """Prepare one image for fitting; raises :class:`FitError` for anything that cannot be right.
 
@@ -148,7 +149,10 @@ def observe(
         camera: Where each pixel looks.
         altitude: Of the camera above the ground, km.
         sun: Unit vector towards the sun.
-        noise: Standard deviation relative to the signal; a number, or one per channel, pixel, or both.
+        noise: Standard deviation relative to the signal; a number, or one per channel, pixel, or both. It must not depend on
+            the error of the pixel itself: the path tracer's standard error of each pixel is small where too little light was
+            found, and weighs those pixels most. Its RMS over the picture is right. Channels count as independent; those of one
+            trace share their paths, so that a picture whose noise is mostly the Monte Carlo's has too small error bars.
         noise_shot: Variance per unit of signal (photon noise), like ``noise``.
         noise_floor: Standard deviation of a dark pixel, like ``noise``; default 1e-4 of the image's median, with a free
             pedestal of what that is above its darkest pixels.
@@ -201,7 +205,7 @@ def observe(
         bands: What the channels see of the spectrum; its nodes must be the wavelengths of the atmosphere, whose sun must have
             the irradiance 1. None if every channel is one of the wavelengths.
         merged: How many exposures the picture was merged from (:mod:`diffatmo.brackets`), for the report.
-        name: Of the image, in messages, tables and file names.
+        name: Of the image, in messages, tables and file names. A fit of several without one numbers them.
     """
     refuse = _Refusal(name)
     refuse.unless(isinstance(name, str), "name", name, "a text")

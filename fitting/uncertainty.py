@@ -19,6 +19,7 @@ against it with the noise that they show (:attr:`fitting.problem.Problem.underst
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -35,7 +36,7 @@ from fitting._errors import FitError
 from fitting.elimination import RANK_TOLERANCE
 from fitting.findings import Estimate, Minimum, Setup
 from fitting.nuisances import Nuisances, assumed
-from fitting.observation import Observation, unstack
+from fitting.observation import UNNAMED, Observation, unstack
 from fitting.parameters import Coordinates, Parameters
 from fitting.priors import Prior
 from fitting.quantities import numbers, quantities
@@ -197,6 +198,15 @@ def _listed(given: T | Iterable[T], kind: type[T], name: str, expected: str) -> 
     return found
 
 
+def _numbered(observations: Sequence[Observation]) -> list[Observation]:
+    """Those that were given no name have their number for one, where there are several."""
+    unnamed = sum(o.name == UNNAMED for o in observations) > 1
+    return [
+        replace(o, name=f"{UNNAMED}_{number}") if unnamed and o.name == UNNAMED else o
+        for number, o in enumerate(observations, start=1)
+    ]
+
+
 def _minima(solution: Solution) -> list[Minimum]:
     """The minima of the solution in the numbers that are reported."""
     parameters = solution.parameters
@@ -263,7 +273,9 @@ def fit(
             that is not finite at the start.
     """
     model = Moments() if model is None else model
-    observations = _listed(observations, Observation, "observations", "fitting.observe(...), or a list of them")
+    observations = _numbered(
+        _listed(observations, Observation, "observations", "fitting.observe(...), or a list of them")
+    )
     priors = _listed(priors, Prior, "priors", "fitting.Prior(name, value, error), or a list of them")
     if not isinstance(checkpoint, str | Path | None):
         raise FitError(f"checkpoint: got {checkpoint!r}, expected the path of a file")

@@ -128,3 +128,10 @@ def test_fitted_images_and_residuals():
         used = observation.used
         np.testing.assert_allclose(observation.image[used] / fitted[used] - 1, residual[used], atol=1e-6)
         assert np.std(whitened[used]) == pytest.approx(1, abs=0.06)
+
+
+def test_images_without_a_name_are_numbered():
+    images = toy_sky.observations(name="image", exposure=("fixed", "free", "fixed"))
+    found = fit([*images[:2], *toy_sky.observations(name="third")[2:]], init=toy_sky.start(), free=FREE, model=Toy())
+    assert [o.name for o in found.observations] == ["image_1", "image_2", "third"]
+    assert [e.name for e in found.nuisances] == ["exposure_image_2"]

@@ -125,7 +125,11 @@ class PathTraceSky(Sky):
     def radiance_with_error(
         self, *, altitude: Altitude, view: Direction, sun: Direction, key: PRNGKeyArray | None = None
     ) -> Estimate:
-        """Radiance with its standard error; arguments as for :meth:`radiance`, another ``key`` for another sample."""
+        """Radiance with its standard error; arguments as for :meth:`radiance`, another ``key`` for another sample.
+
+        Of few paths the standard error goes with the error itself: both are small where bright paths were missed. Weights for
+        an average or a fit should come from its mean over many rays. Errors of the wavelengths are correlated.
+        """
         return _ask(self, altitude, view, sun, jnp.inf, True, self.key if key is None else key)
 
     def orders(self, *, altitude: Altitude, view: Direction, sun: Direction, key: PRNGKeyArray | None = None) -> Orders:
